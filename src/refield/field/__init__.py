@@ -1,0 +1,1 @@
+"""A radiance field and how to see it. Tensors only, no files.            imports: scene"""

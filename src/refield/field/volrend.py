@@ -1,0 +1,72 @@
+"""Volume rendering of packed samples (Eq. 1).
+
+Letters: N rays, S samples of all rays in one flat array, ``ray_offsets`` (N + 1,) their prefix sums;
+ray i owns samples ``ray_offsets[i] : ray_offsets[i + 1]``, near to far.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from refield.field import kernels
+from refield.scene.capture import Rays
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Intervals along rays, packed. Distances are along the unit direction, world units."""
+
+    t_starts: Tensor
+    """(S,) float32"""
+    t_ends: Tensor
+    """(S,) float32"""
+    ray_offsets: Tensor
+    """(N + 1,) int64"""
+
+    def __len__(self) -> int:
+        return self.t_starts.shape[0]
+
+    @property
+    def ray_ids(self) -> Tensor:
+        """The ray of each sample, (S,) int64."""
+        counts = self.ray_offsets[1:] - self.ray_offsets[:-1]
+        return torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
+
+    def positions(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """World midpoints (S, 3) and directions (S, 3)."""
+        ids = self.ray_ids
+        d = rays.directions[ids]
+        mid = (self.t_starts + self.t_ends) / 2
+        return rays.origins[ids] + d * mid[:, None], d
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What a set of rays, or a view, looks like. Leading shape (N,) or (H, W)."""
+
+    rgb: Tensor
+    """(..., 3) float32 in [0, 1], on a black background"""
+    depth: Tensor
+    """(...,) float32 expected distance along the unit direction, of the part that is opaque; 0 where nothing is"""
+    opacity: Tensor
+    """(...,) float32 in [0, 1]"""
+
+    def reshape(self, *shape: int) -> Rendering:
+        return Rendering(self.rgb.reshape(*shape, 3), self.depth.reshape(shape), self.opacity.reshape(shape))
+
+
+def weights(sigmas: Tensor, samples: Samples) -> Tensor:
+    """w_i = T_i (1 - exp(-sigma_i delta_i)), T_i = exp(-sum_{j<i} sigma_j delta_j); (S,), differentiable (Eq. 1)."""
+    return kernels.weights(sigmas, samples.t_starts, samples.t_ends, samples.ray_offsets)
+
+
+def composite(sigmas: Tensor, rgbs: Tensor, samples: Samples) -> Rendering:
+    """Eq. 1: sigmas (S,), rgbs (S, 3) -> Rendering of N rays, differentiable."""
+    w = weights(sigmas, samples)
+    mid = (samples.t_starts + samples.t_ends) / 2
+    summed = kernels.accumulate(w, torch.cat([rgbs, mid[:, None], torch.ones_like(mid)[:, None]], -1), samples.ray_offsets)
+    opacity = summed[:, 4]
+    return Rendering(summed[:, :3], summed[:, 3] / opacity.clamp_min(1e-6), opacity)

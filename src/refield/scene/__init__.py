@@ -1,0 +1,1 @@
+"""What the world is: poses, cameras, photos, captures and changes. Facts only; imports nothing of ours."""

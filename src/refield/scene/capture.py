@@ -1,0 +1,86 @@
+"""One visit's photos: Photo → Frame → Capture, and the rays of a frame.
+
+A `Photo` is an image with intrinsics; a `Frame` also knows where it was taken. Two types, so that an unplaced
+photo cannot be used as a view by mistake. World units and axes are the capture's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from refield.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class Photo:
+    """An image file and the camera that took it; where it was taken is not known."""
+
+    path: Path
+    camera: Camera
+    name: str
+    """How the file calls it (the ``file_path`` of a transforms.json); unique within a capture."""
+
+
+@dataclass(frozen=True)
+class Frame(Photo):
+    """A photo with its pose."""
+
+    world_from_cam: Tensor
+    """(4, 4) float64, OpenCV camera axes."""
+
+    @property
+    def centre(self) -> Tensor:
+        """Camera centre in the world, (3,) float64."""
+        return self.world_from_cam[:3, 3]
+
+
+@dataclass(frozen=True)
+class Rays:
+    """N rays: ``origins`` and unit ``directions``, both (N, 3) float32, world."""
+
+    origins: Tensor
+    directions: Tensor
+
+    def __len__(self) -> int:
+        return self.origins.shape[0]
+
+    def __getitem__(self, index: Tensor | slice) -> Rays:
+        return Rays(self.origins[index], self.directions[index])
+
+
+def camera_rays(camera: Camera, world_from_cam: Tensor, pixels: Tensor | None = None) -> Rays:
+    """World rays through ``pixels`` (N, 2), or through every pixel centre row by row."""
+    pixels = camera.pixel_centres() if pixels is None else pixels
+    d = camera.unproject(pixels.double()) @ world_from_cam[:3, :3].T
+    return Rays(world_from_cam[:3, 3].float().expand(len(d), 3).contiguous(), d.float().contiguous())
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Posed photos of one state of the scene, and what structure from motion knows of it."""
+
+    frames: tuple[Frame, ...]
+    points: Tensor = field(default_factory=lambda: torch.zeros(0, 3))
+    """(P, 3) float32 SfM points in the world; may be empty."""
+    held_out_every: int = 10
+    """Every so-many-th frame is kept from training to measure quality; 0 holds none out."""
+
+    @property
+    def held_out(self) -> tuple[Frame, ...]:
+        k = self.held_out_every
+        return tuple(f for i, f in enumerate(self.frames) if k and i % k == k // 2)
+
+    @property
+    def train(self) -> tuple[Frame, ...]:
+        k = self.held_out_every
+        return tuple(f for i, f in enumerate(self.frames) if not (k and i % k == k // 2))
+
+
+def centres(frames: Iterable[Frame]) -> Tensor:
+    """Camera centres (F, 3) float64."""
+    return torch.stack([f.centre for f in frames])

@@ -1,0 +1,166 @@
+"""What changed between two visits: the only thing that crosses from `estimate` to `update`.
+
+An object is an occupancy grid (§4.2.4) in the world, a kind, and for a moved one the paper's T, here
+``new_from_old``. Files: ``change.json``, ``grid_<i>.npz``, ``masks/`` (see `refield.workspace`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from refield.scene.capture import Frame
+from refield.scene.pose import invert, transform
+
+Kind = Literal["moved", "removed", "added"]
+
+
+@dataclass(frozen=True)
+class OccupancyGrid:
+    """An object's 3-D mask M: values at the grid's nodes, corner to corner of a world-aligned box."""
+
+    aabb: Tensor
+    """(2, 3) float32: minimum and maximum corner, world."""
+    values: Tensor
+    """(X, Y, Z) float32 in [0, 1]; node (i, j, k) lies at ``lerp(aabb, (i, j, k) / (size - 1))``."""
+
+    def sample(self, x: Tensor) -> Tensor:
+        """Trilinear value at world points (..., 3) -> (...,); 0 outside the box."""
+        lo, hi = self.aabb.to(x.device, x.dtype)
+        unit = (x - lo) / (hi - lo) * 2 - 1
+        grid = self.values.to(x.device, x.dtype).permute(2, 1, 0)[None, None]
+        flat = unit.reshape(1, -1, 1, 1, 3)
+        out = functional.grid_sample(grid, flat, mode="bilinear", padding_mode="border", align_corners=True)
+        inside = (unit.abs() <= 1).all(-1)
+        return torch.where(inside, out.reshape(x.shape[:-1]), torch.zeros_like(x[..., 0]))
+
+    def contains(self, x: Tensor) -> Tensor:
+        """M(x): world points (..., 3) -> (...,) bool, trilinear value > 0.5 (§4.2.4)."""
+        return self.sample(x) > 0.5
+
+    def nodes(self) -> Tensor:
+        """World positions of the nodes, (X, Y, Z, 3) float32."""
+        lo, hi = self.aabb
+        axes = [torch.linspace(float(a), float(b), n) for a, b, n in zip(lo, hi, self.values.shape)]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+
+    def occupied(self) -> Tensor:
+        """World positions of the nodes inside the object, (K, 3) float32."""
+        return self.nodes()[self.values > 0.5]
+
+    def tight_aabb(self) -> Tensor:
+        """(2, 3) box around the occupied nodes, half a cell wider; the grid's own box if none is occupied."""
+        points = self.occupied()
+        if len(points) == 0:
+            return self.aabb
+        size = torch.tensor(self.values.shape)
+        half_cell = (self.aabb[1] - self.aabb[0]) / (size - 1) / 2
+        return torch.stack([points.amin(0) - half_cell, points.amax(0) + half_cell])
+
+    def dilated(self, factor: float) -> OccupancyGrid:
+        """M_out (§10.1.3): grown by the same distance on every side until its box is ``factor`` times as large.
+
+        The distance is half of (factor - 1) times the mean side of the tight box.
+        """
+        box = self.tight_aabb()
+        reach = float((box[1] - box[0]).mean()) * (factor - 1) / 2
+        size = torch.tensor(self.values.shape, dtype=torch.float32)
+        cell = float(((self.aabb[1] - self.aabb[0]) / (size - 1)).max())
+        step = max(cell, reach / 16)  # a coarser lattice is enough for a region's outline
+        lo, hi = box[0] - reach - step, box[1] + reach + step
+        shape = ((hi - lo) / step).ceil().long() + 1
+        hi = lo + (shape - 1) * step
+        grid = OccupancyGrid(torch.stack([lo, hi]), torch.zeros(*shape.tolist()))
+        from scipy.ndimage import distance_transform_edt
+
+        inside = self.contains(grid.nodes()).numpy()
+        distance = torch.from_numpy(distance_transform_edt(~inside)).float() * step
+        # a ramp of one step around the reach keeps the trilinear 0.5 level on the true distance
+        return replace(grid, values=(0.5 + (reach - distance) / (2 * step)).clamp(0, 1))
+
+    def moved(self, new_from_old: Tensor) -> OccupancyGrid:
+        """The same object at its new place, resampled on a world-aligned grid."""
+        size = torch.tensor(self.values.shape, dtype=torch.float32)
+        cell = float(((self.aabb[1] - self.aabb[0]) / (size - 1)).min())
+        corners = torch.cartesian_prod(*self.tight_aabb().T.double())
+        corners = transform(new_from_old, corners).float()
+        lo, hi = corners.amin(0) - cell, corners.amax(0) + cell
+        shape = ((hi - lo) / cell).ceil().long() + 1
+        grid = OccupancyGrid(torch.stack([lo, lo + (shape - 1) * cell]), torch.zeros(*shape.tolist()))
+        return replace(grid, values=self.sample(transform(invert(new_from_old), grid.nodes())))
+
+
+@dataclass(frozen=True)
+class ObjectChange:
+    """One object that moved, left or arrived."""
+
+    kind: Kind
+    grid: OccupancyGrid
+    """Where it was (moved, removed) or where it is now (added)."""
+    new_from_old: Tensor | None = None
+    """(4, 4) float64, the paper's T; only for ``moved``."""
+    masks: tuple[Tensor | None, ...] = ()
+    """Per old training frame, (H, W) bool: where the object was seen. None = unsure, the frame is left out
+    (§10.1.3). Empty for ``added``."""
+    masks_in: tuple[Tensor | None, ...] = ()
+    """Per old training frame, (H, W) bool: where its new place projects. Empty for ``removed``."""
+    confidence: float = 1.0
+    covariance: Tensor | None = None
+    """(6, 6) float64 of the twist (world units, radians) that left-multiplies ``new_from_old``."""
+    note: str = ""
+    """What the user should know: an unobservable turn, a weak match."""
+
+    def __post_init__(self) -> None:
+        if (self.kind == "moved") != (self.new_from_old is not None):
+            raise ValueError(f"new_from_old belongs to a moved object, and only to one (kind is {self.kind!r})")
+
+    @property
+    def old_from_new(self) -> Tensor:
+        """T⁻¹ of a moved object, (4, 4) float64."""
+        if self.new_from_old is None:
+            raise ValueError(f"an object that was {self.kind} has no pose change")
+        return invert(self.new_from_old)
+
+    @property
+    def grid_now(self) -> OccupancyGrid | None:
+        """Where the object is now; None for one that left."""
+        if self.kind == "removed":
+            return None
+        return self.grid if self.new_from_old is None else self.grid.moved(self.new_from_old)
+
+
+@dataclass(frozen=True)
+class PlacedPhoto:
+    """What became of one new photo."""
+
+    name: str
+    status: Literal["used", "rejected"]
+    why: str = ""
+    frame: Frame | None = None
+
+    def __post_init__(self) -> None:
+        if (self.status == "used") != (self.frame is not None):
+            raise ValueError("a used photo has a frame; a rejected one has none")
+
+
+@dataclass(frozen=True)
+class SceneChange:
+    """Everything that changed. No objects means: nothing changed."""
+
+    objects: tuple[ObjectChange, ...] = ()
+    photos: tuple[PlacedPhoto, ...] = ()
+    why: str = ""
+    """In one sentence, why this was concluded (also when nothing was)."""
+    masks_in: tuple[Tensor, ...] = field(default=())
+    """Per used photo, (H, W) bool: all changed pixels showing what is there now."""
+    masks_out: tuple[Tensor, ...] = field(default=())
+    """Per used photo, (H, W) bool: all changed pixels where something used to be."""
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """The new photos that are used, with their poses."""
+        return tuple(p.frame for p in self.photos if p.frame is not None)
