@@ -1,0 +1,17 @@
+"""One self-contained page per visit: before · photos · after, masks, poses, numbers.
+
+Built from plain facts and pictures, so that whoever joins the stages decides what to show.
+"""
+
+from refield.report.pictures import write_contact_sheet
+from refield.report.visit import Comparison, VisitReport, summary, visit_report_dict
+from refield.report.write import write_report
+
+__all__ = [
+    "Comparison",
+    "VisitReport",
+    "summary",
+    "visit_report_dict",
+    "write_contact_sheet",
+    "write_report",
+]

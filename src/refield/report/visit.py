@@ -1,0 +1,150 @@
+"""What a visit's report holds, and the same as JSON and as one sentence."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import metadata
+from typing import Any
+
+from torch import Tensor
+
+from refield.scene.change import ObjectChange, SceneChange
+from refield.scene.pose import rotation_log
+
+_VERSIONS_OF = ("refield", "torch", "numpy", "numba", "opencv-python-headless", "pycolmap")
+
+
+def versions() -> dict[str, str]:
+    """Python's and the main packages' versions; a package that is not installed is left out."""
+    found = {"python": platform.python_version()}
+    for name in _VERSIONS_OF:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One view: the old field's render, the photograph, the updated field's render. Pictures are (H, W, 3),
+    uint8 or float in [0, 1]; what is not known is None and is left out of the page."""
+
+    name: str
+    photo: Tensor | None
+    before: Tensor | None = None
+    after: Tensor | None = None
+    mask_in: Tensor | None = None
+    """(H, W) bool: changed pixels that show what is there now"""
+    mask_out: Tensor | None = None
+    """(H, W) bool: changed pixels where something used to be"""
+
+
+@dataclass(frozen=True)
+class VisitReport:
+    """Everything the page shows. Only `title` and `change` are needed."""
+
+    title: str
+    """for example the workspace's name and the visit's number"""
+    change: SceneChange
+    photos: tuple[Comparison, ...] = ()
+    """the new photos, used and rejected, under the names of ``change.photos``"""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """per stage, in the order in which they ran"""
+    evaluation: Mapping[str, Any] | None = None
+    """``refield.evaluate.Report.to_dict()``"""
+    evaluation_views: tuple[Comparison, ...] = ()
+    """the evaluation's views; ``photo`` is the truth"""
+    facts: Mapping[str, str | int | float] = field(default_factory=dict)
+    """further numbers worth a line each, such as the field's PSNR on held-out frames"""
+    warnings: tuple[str, ...] = ()
+    """what the user should know"""
+    versions: Mapping[str, str] = field(default_factory=versions)
+    """of Python and the packages"""
+
+
+def turn(new_from_old: Tensor) -> tuple[float, list[float]]:
+    """The rotation of a pose change: angle in degrees [0, 180] and unit axis (0, 0, 0 for no turn)."""
+    phi = rotation_log(new_from_old[:3, :3].double())
+    angle = float(phi.norm())
+    return math.degrees(angle), (phi / angle).tolist() if angle > 1e-9 else [0.0, 0.0, 0.0]
+
+
+def object_shift(change: ObjectChange) -> list[float] | None:
+    """How far a moved object's centre went, (3,) world units: unlike T's own last column it does not depend on
+    where the world's origin lies."""
+    if change.new_from_old is None:
+        return None
+    centre = change.grid.tight_aabb().mean(0).double()
+    t = change.new_from_old.double()
+    return (t[:3, :3] @ centre + t[:3, 3] - centre).tolist()
+
+
+def uncertainty(change: ObjectChange) -> tuple[float, float] | None:
+    """Standard deviations of a pose change from its covariance: of the object's centre (world units, root of the
+    summed variances) and of the turn (degrees)."""
+    if change.covariance is None or change.new_from_old is None:
+        return None
+    cov = change.covariance.double()
+    now = change.new_from_old.double()
+    centre = now[:3, :3] @ change.grid.tight_aabb().mean(0).double() + now[:3, 3]
+    lever = cov.new_zeros(3, 6)  # d centre / d twist = [I, -skew(centre)] for a left-multiplied twist
+    lever[:, :3] = cov.new_tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    x, y, z = centre.tolist()
+    lever[:, 3:] = cov.new_tensor([[0, z, -y], [-z, 0, x], [y, -x, 0]])
+    spread = float((lever @ cov @ lever.T).trace().clamp_min(0).sqrt())
+    return spread, math.degrees(float(cov[3:, 3:].trace().clamp_min(0).sqrt()))
+
+
+def summary(change: SceneChange) -> str:
+    """One sentence: "2 objects changed: 1 moved, 1 removed, seen in 4 new photos (1 rejected)."""
+    used = len(change.frames)
+    rejected = len(change.photos) - used
+    photos = f"{used} new photo{'' if used == 1 else 's'}" + (f" ({rejected} rejected)" if rejected else "")
+    if not change.objects:
+        return f"Nothing changed, by {photos}."
+    kinds = Counter(o.kind for o in change.objects)
+    parts = ", ".join(f"{kinds[k]} {k}" for k in ("moved", "removed", "added") if kinds[k])
+    n = len(change.objects)
+    return f"{n} object{'' if n == 1 else 's'} changed: {parts}; seen in {photos}."
+
+
+def visit_report_dict(report: VisitReport) -> dict[str, Any]:
+    """The content of ``report.json``: everything but the pictures; only what JSON can hold (no NaN)."""
+    return {
+        "title": report.title,
+        "summary": summary(report.change),
+        "why": report.change.why,
+        "objects": [_object_dict(o) for o in report.change.objects],
+        "photos": [{"file": p.name, "status": p.status, "why": p.why} for p in report.change.photos],
+        "warnings": list(report.warnings),
+        "facts": {k: finite(v) for k, v in report.facts.items()},
+        "seconds": {k: finite(v) for k, v in report.seconds.items()},
+        "evaluation": None if report.evaluation is None else dict(report.evaluation),
+        "versions": dict(report.versions),
+    }
+
+
+def finite(value: Any) -> Any:
+    """A number that is not finite becomes None: JSON has no word for it."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _object_dict(o: ObjectChange) -> dict[str, Any]:
+    sure = uncertainty(o)
+    return {
+        "kind": o.kind,
+        "aabb": o.grid.tight_aabb().tolist(),
+        "new_from_old": None if o.new_from_old is None else o.new_from_old.tolist(),
+        "shift": object_shift(o),
+        "angle_deg": None if o.new_from_old is None else turn(o.new_from_old)[0],
+        "axis": None if o.new_from_old is None else turn(o.new_from_old)[1],
+        "std_shift": None if sure is None else finite(sure[0]),
+        "std_angle_deg": None if sure is None else finite(sure[1]),
+        "confidence": finite(o.confidence),
+        "note": o.note,
+    }
