@@ -1,0 +1,131 @@
+"""The one image decoder: EXIF orientation applied, modes on an allow-list, sizes limited before decoding.
+
+Transparent pictures are composited on black, which is what volume rendering shows where nothing is.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import ExifTags, Image, ImageOps
+from torch import Tensor
+
+from refield.scene.capture import Photo
+from refield.scene.errors import InputError
+from refield.scene.files import write_bytes
+
+MAX_PIXELS = 64_000_000
+"""A 48-megapixel phone photo passes; what is larger is more likely a bomb or a mistake."""
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
+_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM")  # nothing that starts another program (EPS)
+_DIRECT = ("L", "RGB", "1")
+_WITH_ALPHA = ("RGBA", "LA", "PA", "P")  # a palette may carry transparency
+_SWAPPED = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
+
+
+@contextmanager
+def _opened(path: Path, max_pixels: int) -> Iterator[Image.Image]:
+    """The image's header, size checked; every failure in the block becomes an InputError naming the file."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's own size warning; ours is an error below
+            with Image.open(path, formats=_FORMATS) as image:
+                width, height = image.size
+                if width * height > max_pixels:
+                    what = f"{width}x{height} pixels are over the limit of {max_pixels / 1e6:.0f} megapixels"
+                    raise InputError(path, what, "scale the image down")
+                yield image
+    except FileNotFoundError:
+        raise InputError(path, "there is no such image", "check the path") from None
+    except Image.DecompressionBombError:
+        raise InputError(path, "claims a gigantic size", "check the file") from None
+    except Image.UnidentifiedImageError:
+        known = ", ".join(_FORMATS)
+        raise InputError(path, "is not an image that can be read", f"give one of {known}") from None
+    except (OSError, ValueError, SyntaxError, EOFError) as error:  # truncated data arrives as any of these
+        raise InputError(path, f"cannot be decoded ({error})", "replace the file or leave it out") from None
+
+
+def _orientation(image: Image.Image) -> int:
+    return int(image.getexif().get(ExifTags.Base.Orientation, 1) or 1)
+
+
+def read_size(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[int, int]:
+    """(width, height) from the header alone, as the picture stands upright.
+
+    Raises:
+        InputError: missing, not an image, or too large.
+    """
+    with _opened(path, max_pixels) as image:
+        width, height = image.size
+        return (height, width) if _orientation(image) in _SWAPPED else (width, height)
+
+
+def read_image(
+    path: Path, *, max_pixels: int = MAX_PIXELS, background: tuple[int, int, int] = (0, 0, 0)
+) -> Tensor:
+    """An image as uint8 (H, W, 3), upright; what is transparent shows ``background``.
+
+    Raises:
+        InputError: missing, truncated, too large, or of a mode whose colours would be a guess (CMYK,
+            16-bit grey).
+    """
+    with _opened(path, max_pixels) as image:
+        mode = image.mode
+        if mode not in _DIRECT + _WITH_ALPHA:
+            what = f"has the pixel mode {mode}, whose colours would be a guess"
+            raise InputError(path, what, "save it as 8-bit RGB")
+        upright = ImageOps.exif_transpose(image)
+        if mode in _WITH_ALPHA:
+            upright = upright.convert("RGBA")
+            upright = Image.alpha_composite(Image.new("RGBA", upright.size, (*background, 255)), upright)
+        return torch.from_numpy(np.array(upright.convert("RGB")))
+
+
+def read_mask(path: Path, *, max_pixels: int = MAX_PIXELS) -> Tensor:
+    """A mask as bool (H, W): true where brighter than 127, or where 1 if no pixel is brighter than 1.
+
+    Raises:
+        InputError: missing, truncated, too large, or not an 8-bit image.
+    """
+    with _opened(path, max_pixels) as image:
+        if image.mode not in _DIRECT + _WITH_ALPHA:
+            raise InputError(path, f"has the pixel mode {image.mode}", "save the mask as 8-bit grey")
+        grey = np.array(ImageOps.exif_transpose(image).convert("RGB")).max(-1)
+        return torch.from_numpy(grey > (127 if grey.max() > 1 else 0))
+
+
+def write_image(path: Path, image: Tensor) -> None:
+    """Write a PNG at once: uint8 or float [0, 1] (H, W, 3) or (H, W), or a bool (H, W) mask as 0 and 255."""
+    image = image.detach().cpu()
+    if image.dtype == torch.bool:
+        image = image.to(torch.uint8) * 255
+    elif image.is_floating_point():
+        if not bool(image.isfinite().all()):
+            raise ValueError(f"{path}: the picture holds values that are not finite")
+        image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+    buffer = io.BytesIO()
+    Image.fromarray(image.numpy()).save(buffer, format="PNG")
+    write_bytes(path, buffer.getvalue())
+
+
+def frame_image(photo: Photo) -> Tensor:
+    """The pixels of a photo, uint8 (H, W, 3).
+
+    Raises:
+        InputError: as `read_image`, or if the size is not the camera's.
+    """
+    image = read_image(photo.path)
+    height, width = image.shape[:2]
+    if (width, height) != (photo.camera.width, photo.camera.height):
+        expected = f"its camera says {photo.camera.width}x{photo.camera.height}"
+        raise InputError(
+            photo.path, f"has {width}x{height} pixels, {expected}", "correct w and h, or the image"
+        )
+    return image

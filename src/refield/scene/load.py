@@ -1,0 +1,50 @@
+"""Find out how a capture was handed over, and load it: transforms.json, or a COLMAP model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from refield.scene import colmap, images, transforms_json
+from refield.scene.capture import Capture, Frame
+from refield.scene.errors import InputError
+from refield.scene.files import log_warning
+from refield.scene.left_out import Warn
+
+_GIVE = "a transforms.json (nerfstudio, instant-ngp) or a COLMAP model in sparse/0, with the images beside it"
+
+
+def load_capture(data: Path, *, warn: Warn = log_warning) -> Capture:
+    """Posed photos from a transforms.json (file or folder), else from a COLMAP model in the folder.
+
+    Raises:
+        InputError: nothing of the kind is there, or what is there cannot be used.
+    """
+    if not data.exists():
+        raise InputError(data, "there is no such file or folder", f"give {_GIVE}")
+    if data.is_file() or (data / transforms_json.NAME).is_file():
+        return transforms_json.load_transforms(data, warn=warn)
+    if colmap.find_models(data):
+        return colmap.load_colmap(data, warn=warn)
+    raise _unposed(data)
+
+
+def load_new_photos(photos: Path, capture: Capture, *, warn: Warn = log_warning) -> list[Frame]:
+    """A few new photos with poses in the capture's world.
+
+    Raises:
+        InputError: no poses are given, or a photo is missing or unreadable.
+    """
+    if not photos.exists():
+        raise InputError(photos, "there is no such file or folder", "give the folder of the new photos")
+    if photos.is_dir() and not (photos / transforms_json.NAME).is_file():
+        raise _unposed(photos, "a transforms.json with their poses in the capture's world")
+    return transforms_json.load_photos(photos, warn=warn)
+
+
+def _unposed(folder: Path, give: str = _GIVE) -> InputError:
+    count = sum(p.suffix.lower() in images.SUFFIXES for p in [*folder.glob("*"), *folder.glob("images/*")])
+    if count:
+        return InputError(
+            folder, f"holds {count} photos but no camera poses, which are needed for now", f"give {give}"
+        )
+    return InputError(folder, "holds neither transforms.json nor a COLMAP model", f"give {give}")
