@@ -1,0 +1,97 @@
+"""Look a moved object up where it used to be (Eqs. 3, 16).
+
+A field that was fitted before the move still holds the object, at its old place. A sample at the new place therefore
+asks at ``old_from_new @ x``, along the direction turned back by the same rotation. Everything is in the world frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from refield.scene.change import OccupancyGrid, SceneChange
+from refield.scene.pose import invert, rotate, transform
+
+
+@dataclass(frozen=True)
+class Move:
+    """One rigid motion of what a grid holds."""
+
+    grid: OccupancyGrid
+    """M: where the object was"""
+    new_from_old: Tensor
+    """(4, 4) float64, the paper's T"""
+
+    @cached_property
+    def old_from_new(self) -> Tensor:
+        """T⁻¹, (4, 4) float64."""
+        return invert(self.new_from_old)
+
+    @cached_property
+    def box_now(self) -> Tensor:
+        """(2, 3) float32, a world box around M at its new place."""
+        corners = transform(self.new_from_old, torch.cartesian_prod(*outline(self.grid).T.double()))
+        return torch.stack([corners.amin(0), corners.amax(0)]).float()
+
+    def arrived(self, x: Tensor) -> Tensor:
+        """M(T⁻¹ x): world points (..., 3) -> (...,) bool, whether the object is there now."""
+        flat = x.detach().reshape(-1, 3)
+        found = torch.zeros(len(flat), dtype=torch.bool, device=x.device)
+        near = inside_box(flat, self.box_now).nonzero()[:, 0]
+        if len(near):
+            found[near] = self.grid.contains(transform(self.old_from_new, flat[near]))
+        return found.reshape(x.shape[:-1])
+
+
+def moves_of(change: SceneChange) -> tuple[Move, ...]:
+    """The motions of a change, in the order of its objects."""
+    return tuple(Move(o.grid, o.new_from_old) for o in change.objects if o.new_from_old is not None)
+
+
+def move_in(x: Tensor, d: Tensor, moves: tuple[Move, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """Eq. 3 for any number of objects; where two claim a point, the first has it.
+
+    World points and directions (S, 3) -> where and along what to ask, (S, 3) each, and which move did it, (S,)
+    int64, -1 where nothing moved in. Differentiable in x, d and ``new_from_old``.
+    """
+    owner = torch.full(x.shape[:1], -1, dtype=torch.long, device=x.device)
+    for i, move in enumerate(moves):
+        owner[move.arrived(x) & (owner < 0)] = i
+    return *_looked_up(x, d, owner, [m.old_from_new for m in moves]), owner
+
+
+def two_way(x: Tensor, d: Tensor, move: Move) -> tuple[Tensor, Tensor]:
+    """Eq. 16: the new place asks at the old one, and the old place at the new one (§10.1.2); move-in wins.
+
+    World points and directions (S, 3) -> (S, 3), (S, 3). Its own inverse where the two places do not overlap.
+    """
+    in_new = move.arrived(x)
+    in_old = move.grid.contains(x.detach()) & ~in_new
+    owner = torch.where(in_new, 0, torch.where(in_old, 1, -1))
+    return _looked_up(x, d, owner, [move.old_from_new, move.new_from_old])
+
+
+def _looked_up(x: Tensor, d: Tensor, owner: Tensor, poses: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Points and directions of each owner moved by its pose; the others are left as they are."""
+    for i, pose in enumerate(poses):
+        mine = (owner == i).nonzero()[:, 0]
+        if len(mine):
+            x = x.index_copy(0, mine, transform(pose, x[mine]))
+            d = d.index_copy(0, mine, rotate(pose, d[mine]))
+    return x, d
+
+
+def outline(grid: OccupancyGrid) -> Tensor:
+    """(2, 3) float32, a world box that holds every point the grid contains: its occupied nodes and one cell more."""
+    box = grid.tight_aabb()
+    half_cell = (grid.aabb[1] - grid.aabb[0]) / (torch.tensor(grid.values.shape) - 1) / 2
+    return torch.stack([box[0] - half_cell, box[1] + half_cell])
+
+
+def inside_box(x: Tensor, box: Tensor) -> Tensor:
+    """World points (..., 3), world box (2, 3) -> (...,) bool."""
+    lo, hi = box.to(x.device, x.dtype)
+    return ((x >= lo) & (x <= hi)).all(-1)
