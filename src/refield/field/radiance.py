@@ -1,13 +1,26 @@
-"""The Field seam: what a radiance field is to everything else. (Eq. 1's F: (x, d) -> (sigma, c).)"""
+"""The Field seam, and the default field: a hash grid with two small networks (Eq. 1's F: (x, d) -> (sigma, c))."""
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
-from torch import Tensor
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torch.nn import functional
 
+from refield.field import kernels
+from refield.field.encoding import Contraction, HashGrid, geometric_levels
+from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
+from refield.scene.errors import InputError
+
+FORMAT = 1
 
 
 class Sampler(Protocol):
@@ -26,7 +39,7 @@ class Field(Protocol):
     """
 
     @property
-    def sampler(self) -> Sampler: ...
+    def sampler(self) -> OccupancySampler: ...
 
     def density(self, x: Tensor) -> Tensor:
         """World points (..., 3) -> sigma (...,), per world unit."""
@@ -35,3 +48,143 @@ class Field(Protocol):
     def __call__(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """World points (..., 3) and unit directions (..., 3) -> sigma (...,) and rgb (..., 3) in [0, 1]."""
         ...
+
+
+@dataclass(frozen=True)
+class HashFieldConfig:
+    """Shape of a `HashField`."""
+
+    levels: int = 10
+    """of the hash grid"""
+    coarsest: int = 16
+    """cells a side of the contracted cube on the coarsest level"""
+    finest: int = 512
+    """cells a side on the finest level"""
+    log2_table: int = 16
+    """entries of a level's table; 2^16 entries of two floats fit a core's L2 cache"""
+    width: int = 32
+    """of both networks' hidden layers; on a CPU they are the cost"""
+    geometry_features: int = 15
+    """handed from the density to the colour network"""
+
+
+class HashField(nn.Module):
+    """Hash grid → density network → colour network, over contracted space.
+
+    The density is exactly zero where the sampler does not look, so that the field is what its renderings show.
+    """
+
+    def __init__(self, config: HashFieldConfig, sampler: OccupancySampler, seed: int = 0) -> None:
+        super().__init__()
+        g = torch.Generator().manual_seed(seed)
+        self.config = config
+        self.sampler = sampler
+        levels = geometric_levels(config.coarsest, config.finest, config.levels)
+        self.encoding = HashGrid(levels, 1 << config.log2_table, g)
+        w, k = config.width, config.geometry_features
+        self.density_in = _weight(w, self.encoding.width, g)
+        self.density_out = _weight(1 + k, w, g)
+        self.colour_in = _weight(w, k + 16, g)
+        self.colour_mid = _weight(w, w, g)
+        self.colour_out = _weight(3, w, g)
+
+    @property
+    def contraction(self) -> Contraction:
+        return self.sampler.contraction
+
+    def density(self, x: Tensor) -> Tensor:
+        """World points (..., 3) -> sigma (...,), per world unit."""
+        flat = x.reshape(-1, 3)
+        sigma = self._sigma(functional.linear(self._hidden(flat), self.density_out[:1])[:, 0])
+        return self._where_seen(sigma, flat).reshape(x.shape[:-1])
+
+    def forward(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+        """World points (..., 3), unit directions (..., 3) -> sigma (...,), rgb (..., 3) in [0, 1]."""
+        flat = x.reshape(-1, 3)
+        out = functional.linear(self._hidden(flat), self.density_out)
+        features = torch.cat([out[:, 1:], kernels.spherical_harmonics(d.reshape(-1, 3))], -1)
+        hidden = functional.relu(functional.linear(features, self.colour_in))
+        hidden = functional.relu(functional.linear(hidden, self.colour_mid))
+        rgb = torch.sigmoid(functional.linear(hidden, self.colour_out))
+        sigma = self._where_seen(self._sigma(out[:, 0]), flat)
+        return sigma.reshape(x.shape[:-1]), rgb.reshape(x.shape)
+
+    def _hidden(self, flat: Tensor) -> Tensor:
+        return functional.relu(functional.linear(self.encoding(self.contraction(flat)), self.density_in))
+
+    def _sigma(self, raw: Tensor) -> Tensor:
+        return _truncated_exp(raw) / self.contraction.radius
+
+    def _where_seen(self, sigma: Tensor, x: Tensor) -> Tensor:
+        if self.training:
+            return sigma
+        return torch.where(self.sampler.occupied(x.detach()), sigma, torch.zeros_like(sigma))
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Everything needed to rebuild the field: named tensors, and facts that JSON can hold."""
+        s = self.sampler
+        tensors = {k: v.detach().contiguous() for k, v in self.state_dict().items()}
+        tensors["occupancy"] = s.grid.contiguous()
+        facts = {
+            "architecture": "HashField",
+            "config": asdict(self.config),
+            "contraction": {"centre": s.contraction.centre.tolist(), "radius": s.contraction.radius},
+            "sampler": {"step": s.step, "near": s.near, "far": s.far},
+        }
+        return tensors, facts
+
+    @staticmethod
+    def from_state(tensors: dict[str, Tensor], facts: dict[str, Any]) -> HashField:
+        """Inverse of :meth:`state`. Raises KeyError or RuntimeError if something is missing or of another shape."""
+        tensors = dict(tensors)
+        space = Contraction(torch.tensor(facts["contraction"]["centre"]), facts["contraction"]["radius"])
+        sampler = OccupancySampler(space, tensors.pop("occupancy"), **facts["sampler"])
+        field = HashField(HashFieldConfig(**facts["config"]), sampler)
+        field.load_state_dict(tensors)
+        return field.eval().requires_grad_(False)
+
+    def save(self, folder: Path) -> None:
+        """Write ``field.safetensors`` and ``field.json`` into an existing folder."""
+        tensors, facts = self.state()
+        save_file(tensors, str(folder / "field.safetensors"))
+        (folder / "field.json").write_text(json.dumps({"format": FORMAT, **facts}, indent=1) + "\n")
+
+    @staticmethod
+    def load(folder: Path) -> HashField:
+        """Inverse of :meth:`save`. Raises InputError naming the file that is missing or not ours."""
+        try:
+            facts = json.loads((folder / "field.json").read_text())
+            if facts.get("format") != FORMAT:
+                raise ValueError(f"format {facts.get('format')!r} is not {FORMAT}")
+            return HashField.from_state(load_file(str(folder / "field.safetensors")), facts)
+        except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
+            raise InputError(folder, f"holds no readable field ({error})", "train it again") from error
+
+    def looking_where(self, grid: Tensor) -> None:
+        """Replace the occupancy grid (R, R, R) uint8."""
+        self.sampler = replace(self.sampler, grid=grid)
+
+
+def _weight(rows: int, columns: int, generator: torch.Generator) -> nn.Parameter:
+    """He-uniform, no bias."""
+    bound = (6 / columns) ** 0.5
+    return nn.Parameter((torch.rand(rows, columns, generator=generator) * 2 - 1) * bound)
+
+
+class _TruncatedExp(torch.autograd.Function):
+    """exp whose gradient does not run away (Instant-NGP)."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
+        out = torch.exp(x.clamp(max=15))
+        ctx.save_for_backward(out)
+        return out
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> Tensor:  # type: ignore[no-untyped-def, override]
+        (out,) = ctx.saved_tensors
+        return grad * out.clamp(max=3e4)
+
+
+def _truncated_exp(x: Tensor) -> Tensor:
+    return _TruncatedExp.apply(x)

@@ -63,10 +63,17 @@ def weights(sigmas: Tensor, samples: Samples) -> Tensor:
     return kernels.weights(sigmas, samples.t_starts, samples.t_ends, samples.ray_offsets)
 
 
+def accumulate_rgb(w: Tensor, rgbs: Tensor, samples: Samples) -> tuple[Tensor, Tensor]:
+    """Weights (S,), colours (S, 3) -> colour (N, 3) on black, opacity (N,)."""
+    summed = kernels.accumulate(w, torch.cat([rgbs, torch.ones_like(w)[:, None]], -1), samples.ray_offsets)
+    return summed[:, :3], summed[:, 3]
+
+
 def composite(sigmas: Tensor, rgbs: Tensor, samples: Samples) -> Rendering:
     """Eq. 1: sigmas (S,), rgbs (S, 3) -> Rendering of N rays, differentiable."""
     w = weights(sigmas, samples)
     mid = (samples.t_starts + samples.t_ends) / 2
-    summed = kernels.accumulate(w, torch.cat([rgbs, mid[:, None], torch.ones_like(mid)[:, None]], -1), samples.ray_offsets)
+    values = torch.cat([rgbs, mid[:, None], torch.ones_like(mid)[:, None]], -1)
+    summed = kernels.accumulate(w, values, samples.ray_offsets)
     opacity = summed[:, 4]
     return Rendering(summed[:, :3], summed[:, 3] / opacity.clamp_min(1e-6), opacity)

@@ -1,0 +1,69 @@
+"""The hot loops of the engine; every one has a plain-torch truth in `reference` and a numba twin in `cpu`.
+
+The twin is chosen by the device of the tensors. Set ``REFIELD_KERNELS=reference`` to run the truth everywhere.
+"""
+
+from __future__ import annotations
+
+import os
+from types import ModuleType
+
+from torch import Tensor
+
+from refield.field.kernels import reference
+
+
+def _twin(t: Tensor) -> ModuleType:
+    if t.device.type != "cpu" or os.environ.get("REFIELD_KERNELS") == "reference":
+        return reference
+    from refield.field.kernels import cpu
+
+    return cpu
+
+
+def contract(x: Tensor, centre: Tensor, radius: float) -> Tensor:
+    """See `reference.contract`."""
+    return _twin(x).contract(x, centre, radius)
+
+
+def hash_encode(unit: Tensor, tables: Tensor, resolutions: tuple[int, ...]) -> Tensor:
+    """See `reference.hash_encode`."""
+    return _twin(unit).hash_encode(unit, tables, resolutions)
+
+
+def spherical_harmonics(d: Tensor) -> Tensor:
+    """See `reference.spherical_harmonics`."""
+    return _twin(d).spherical_harmonics(d)
+
+
+def weights(sigmas: Tensor, t_starts: Tensor, t_ends: Tensor, offsets: Tensor) -> Tensor:
+    """See `reference.weights`."""
+    return _twin(sigmas).weights(sigmas, t_starts, t_ends, offsets)
+
+
+def accumulate(w: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
+    """See `reference.accumulate`."""
+    return _twin(w).accumulate(w, values, offsets)
+
+
+def distortion(w: Tensor, s_starts: Tensor, s_ends: Tensor, offsets: Tensor) -> Tensor:
+    """See `reference.distortion`."""
+    return _twin(w).distortion(w, s_starts, s_ends, offsets)
+
+
+def march(
+    origins: Tensor, directions: Tensor, space: tuple[Tensor, float], grid: Tensor, lattice: tuple[float, float, float],
+    jitter: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `reference.march`."""
+    return _twin(origins).march(origins, directions, space, grid, lattice, jitter)
+
+
+def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, step: int) -> None:
+    """See `reference.adam`."""
+    _twin(param).adam(param, grad, first, second, rate, step)
+
+
+def scatter_max(values: Tensor, cells: Tensor, into: Tensor) -> None:
+    """See `reference.scatter_max`."""
+    _twin(into).scatter_max(values, cells, into)

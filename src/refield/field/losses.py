@@ -1,0 +1,39 @@
+"""What a field is fitted to: colour (Eq. 2) and the distortion loss of mip-NeRF 360; gradient scaling (§10.1)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from refield.field import kernels
+from refield.field.volrend import Samples
+
+
+def colour_loss(rgb: Tensor, truth: Tensor) -> Tensor:
+    """Eq. 2 as a mean: (N, 3), (N, 3) -> ()."""
+    return (rgb - truth).square().mean()
+
+
+def distortion_loss(weights: Tensor, samples: Samples, radius: float) -> Tensor:
+    """Mean distortion of the rays; distances in s = t / (t + radius), so that far haze counts as near haze does."""
+    s0, s1 = (t / (t + radius) for t in (samples.t_starts, samples.t_ends))
+    return kernels.distortion(weights, s0, s1, samples.ray_offsets).mean()
+
+
+class _ScaleGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, scale: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
+        ctx.save_for_backward(scale)
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[no-untyped-def, override]
+        (scale,) = ctx.saved_tensors
+        return grad * (scale if grad.dim() == 1 else scale[:, None]), None
+
+
+def scale_gradients(sigmas: Tensor, rgbs: Tensor, samples: Samples, unit: float) -> tuple[Tensor, Tensor]:
+    """Gradients times min((t / unit)^2, 1): samples near a camera, which few rays cross, do not grow floaters (§10.1)."""
+    mid = (samples.t_starts + samples.t_ends) / 2
+    scale = (mid / unit).square().clamp(max=1.0)
+    return _ScaleGradient.apply(sigmas, scale), _ScaleGradient.apply(rgbs, scale)

@@ -1,0 +1,66 @@
+"""All pixels of a set of posed photos, and the ray of any of them. Photos stay uint8."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from refield.scene.camera import Camera
+from refield.scene.capture import Frame, Rays
+from refield.scene.images import frame_image
+
+_TABLE_BYTES = 1 << 29  # camera-space directions are kept for every pixel of every distinct camera up to here
+
+
+class PixelBank:
+    """P pixels of F photos in one row: colours uint8, rays made on demand."""
+
+    def __init__(self, frames: Sequence[Frame], images: Sequence[Tensor] | None = None) -> None:
+        if not frames:
+            raise ValueError("a pixel bank needs at least one frame")
+        images = [frame_image(f) for f in frames] if images is None else images
+        self.frames = tuple(frames)
+        self.rgb = torch.cat([i.reshape(-1, 3) for i in images])
+        """(P, 3) uint8"""
+        counts = torch.tensor([f.camera.width * f.camera.height for f in frames])
+        self.starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        """(F + 1,) int64: frame i owns pixels ``starts[i] : starts[i + 1]``, row by row"""
+        self._rotations = torch.stack([f.world_from_cam[:3, :3] for f in frames]).float()
+        self._centres = torch.stack([f.centre for f in frames]).float()
+        self._cameras = list(dict.fromkeys(f.camera for f in frames))
+        self._camera_of = torch.tensor([self._cameras.index(f.camera) for f in frames])
+        self._tables: dict[Camera, Tensor] = {}
+        distinct = sum(c.width * c.height for c in self._cameras)
+        self._tabulate = distinct * 12 <= _TABLE_BYTES
+
+    def __len__(self) -> int:
+        return int(self.starts[-1])
+
+    def frame_of(self, pixels: Tensor) -> Tensor:
+        """Index of the frame that owns each pixel, (B,) -> (B,)."""
+        return torch.searchsorted(self.starts, pixels, right=True) - 1
+
+    def rays(self, pixels: Tensor) -> Rays:
+        """World rays through pixel centres, (B,) -> Rays of B."""
+        owner = self.frame_of(pixels)
+        local = pixels - self.starts[owner]
+        d = torch.empty(len(pixels), 3)
+        for k, camera in enumerate(self._cameras):
+            mine = slice(None) if len(self._cameras) == 1 else (self._camera_of[owner] == k).nonzero()[:, 0]
+            d[mine] = self._directions(camera, local[mine])
+        world = (self._rotations[owner] @ d[:, :, None])[:, :, 0]
+        return Rays(self._centres[owner], world)
+
+    def colours(self, pixels: Tensor) -> Tensor:
+        """(B,) -> (B, 3) float32 in [0, 1]."""
+        return self.rgb[pixels].float() / 255
+
+    def _directions(self, camera: Camera, local: Tensor) -> Tensor:
+        if not self._tabulate:
+            v, u = local // camera.width, local % camera.width
+            return camera.unproject(torch.stack([u, v], -1).double() + 0.5).float()
+        if camera not in self._tables:
+            self._tables[camera] = camera.unproject(camera.pixel_centres()).float()
+        return self._tables[camera][local]

@@ -1,0 +1,41 @@
+"""Rays, or a whole view, through any field → Rendering (Eq. 1), in chunks."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from refield.field.radiance import Field
+from refield.field.volrend import Rendering, composite
+from refield.scene.camera import Camera
+from refield.scene.capture import Frame, Rays, camera_rays
+
+CHUNK = 16384  # rays; at 20 samples a ray the activations of a chunk take some 100 MB
+
+
+def render_rays(field: Field, rays: Rays, jitter: bool = False) -> Rendering:
+    """Eq. 1 for N rays at once. Differentiable with respect to whatever the field is differentiable in."""
+    samples = field.sampler(rays, jitter)
+    x, d = samples.positions(rays)
+    sigmas, rgbs = field(x, d)
+    return composite(sigmas, rgbs, samples)
+
+
+def render_many(field: Field, rays: Rays, chunk: int = CHUNK) -> Rendering:
+    """:func:`render_rays` without gradients, chunk by chunk."""
+    with torch.no_grad():
+        parts = [render_rays(field, rays[i : i + chunk]) for i in range(0, len(rays), chunk)]
+    return Rendering(
+        torch.cat([p.rgb for p in parts]), torch.cat([p.depth for p in parts]), torch.cat([p.opacity for p in parts])
+    )
+
+
+def render_camera(field: Field, camera: Camera, world_from_cam: Tensor, chunk: int = CHUNK) -> Rendering:
+    """The view of a posed camera; leading shape (height, width)."""
+    rendering = render_many(field, camera_rays(camera, world_from_cam), chunk)
+    return rendering.reshape(camera.height, camera.width)
+
+
+def render_frame(field: Field, frame: Frame, chunk: int = CHUNK) -> Rendering:
+    """What the field shows from where a photo was taken; leading shape (height, width)."""
+    return render_camera(field, frame.camera, frame.world_from_cam, chunk)

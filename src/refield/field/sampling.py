@@ -1,0 +1,111 @@
+"""Where to look along a ray: an occupancy grid over contracted space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from refield.field import kernels
+from refield.field.encoding import Contraction
+from refield.field.volrend import Samples
+from refield.scene.capture import Rays
+
+
+@dataclass(frozen=True)
+class OccupancySampler:
+    """Samples on a regular lattice along the ray, kept where the grid says that something may be."""
+
+    contraction: Contraction
+    grid: Tensor
+    """(R, R, R) uint8 over the contracted cube; 0 is empty"""
+    step: float
+    """world units within the core cube; grows as the distance to the power of 1.5 outside it"""
+    near: float = 0.0
+    """world units"""
+    far: float = 1e3
+    """in radii of the core cube"""
+
+    @property
+    def resolution(self) -> int:
+        return self.grid.shape[0]
+
+    def __call__(self, rays: Rays, jitter: bool = False) -> Samples:
+        """Packed samples of N rays; see `Samples`."""
+        n = len(rays)
+        shift = torch.rand(n, device=rays.origins.device) if jitter else rays.origins.new_zeros(n)
+        lattice = (self.near, self.far * self.contraction.radius, self.step)
+        space = (self.contraction.centre, self.contraction.radius)
+        with torch.no_grad():
+            return Samples(*kernels.march(rays.origins, rays.directions, space, self.grid, lattice, shift))
+
+    def cells(self, x: Tensor) -> Tensor:
+        """Flat index of the grid cell that holds each world point, (..., 3) -> (...,) int64."""
+        r = self.resolution
+        ijk = ((self.contraction(x) + 2) * (r / 4)).long().clamp_(0, r - 1)
+        return (ijk[..., 0] * r + ijk[..., 1]) * r + ijk[..., 2]
+
+    def occupied(self, x: Tensor) -> Tensor:
+        """Whether the sampler would look at world points (..., 3) -> (...,) bool."""
+        return self.grid.reshape(-1)[self.cells(x)] > 0
+
+    def step_at(self, cells: Tensor) -> Tensor:
+        """Length of a sample in the given cells (K,), world units (K,)."""
+        m = (self._contracted(cells, None)).abs().amax(-1)
+        outside = torch.where(m > 1, 1 / (2 - m).clamp_min(1e-3), torch.ones_like(m))
+        return self.step * outside**1.5
+
+    def points_in(self, cells: Tensor, jitter: bool = True) -> Tensor:
+        """A world point in each cell: random, or its centre. (K,) -> (K, 3)."""
+        offset = torch.rand(len(cells), 3, device=cells.device) if jitter else None
+        return self.contraction.inverse(self._contracted(cells, offset))
+
+    def _contracted(self, cells: Tensor, offset: Tensor | None) -> Tensor:
+        r = self.resolution
+        ijk = torch.stack([cells // (r * r), cells // r % r, cells % r], -1).float()
+        return (ijk + (0.5 if offset is None else offset)) * (4 / r) - 2
+
+    def refreshed(
+        self, density: Callable[[Tensor], Tensor], boxes: Iterable[Tensor], threshold: float = 1e-2, probes: int = 4
+    ) -> OccupancySampler:
+        """The same sampler with the cells that touch the world boxes (2, 3) looked up anew in ``density``.
+
+        A cell is occupied if at one of ``probes`` points a sample would have an opacity above ``threshold``.
+        """
+        grid = self.grid.clone()
+        for box in boxes:
+            cells = self._cells_in(box)
+            grid.view(-1)[cells] = self._probe(density, cells, threshold, probes)
+        return replace(self, grid=grid)
+
+    def _probe(self, density: Callable[[Tensor], Tensor], cells: Tensor, threshold: float, probes: int) -> Tensor:
+        found = torch.zeros(len(cells), dtype=torch.bool, device=cells.device)
+        length = self.step_at(cells)
+        with torch.no_grad():
+            for i in range(probes):
+                x = self.points_in(cells, jitter=i > 0)
+                found |= density(x) * length > -torch.log1p(torch.tensor(-threshold))
+        return found.to(self.grid.dtype)
+
+    def _cells_in(self, box: Tensor) -> Tensor:
+        """Flat indices of the cells whose contracted extent meets a world box (2, 3), one cell of margin."""
+        r = self.resolution
+        corners = torch.cartesian_prod(*torch.as_tensor(box, dtype=torch.float32).T)
+        y = (self.contraction(corners) + 2) * (r / 4)
+        lo, hi = (y.amin(0) - 1).long().clamp(0, r - 1), (y.amax(0) + 1).long().clamp(0, r - 1)
+        axes = [torch.arange(int(a), int(b) + 1) for a, b in zip(lo, hi)]
+        i, j, k = torch.meshgrid(*axes, indexing="ij")
+        return ((i * r + j) * r + k).reshape(-1)
+
+    @staticmethod
+    def from_density(
+        density: Callable[[Tensor], Tensor], contraction: Contraction, step: float, resolution: int = 128
+    ) -> OccupancySampler:
+        """Look the whole world up in ``density``."""
+        empty = torch.zeros(resolution, resolution, resolution, dtype=torch.uint8)
+        sampler = OccupancySampler(contraction, empty, step)
+        everything = torch.arange(resolution**3)
+        found = [sampler._probe(density, c, 1e-2, 4) for c in everything.split(1 << 18)]
+        return replace(sampler, grid=torch.cat(found).reshape(empty.shape))
