@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageOps, PngImagePlugin
 from torch import Tensor
 
 from refield.scene.capture import Photo
@@ -26,6 +26,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 _FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM")  # nothing that starts another program (EPS)
 _DIRECT = ("L", "RGB", "1")
 _WITH_ALPHA = ("RGBA", "LA", "PA", "P")  # a palette may carry transparency
+_MARK = ("Software", "refield")  # in every PNG we write, so that we replace no other
 _SWAPPED = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 
 
@@ -111,8 +112,32 @@ def write_image(path: Path, image: Tensor) -> None:
             raise ValueError(f"{path}: the picture holds values that are not finite")
         image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
     buffer = io.BytesIO()
-    Image.fromarray(image.numpy()).save(buffer, format="PNG")
+    mark = PngImagePlugin.PngInfo()
+    mark.add_text(*_MARK)
+    Image.fromarray(image.numpy()).save(buffer, format="PNG", pnginfo=mark)
     write_bytes(path, buffer.getvalue())
+
+
+def is_ours(path: Path) -> bool:
+    """Whether a file is a PNG that `write_image` wrote, and may be replaced."""
+    try:
+        with Image.open(path, formats=("PNG",)) as image:
+            return image.info.get(_MARK[0]) == _MARK[1]
+    except (OSError, ValueError, SyntaxError):
+        return False
+
+
+def check_decodes(path: Path) -> None:
+    """Decode an image for the errors alone, JPEGs at an eighth of their size.
+
+    Raises:
+        InputError: as `read_image`.
+    """
+    with _opened(path, MAX_PIXELS) as image:
+        if image.mode not in _DIRECT + _WITH_ALPHA:
+            raise InputError(path, f"has the pixel mode {image.mode}", "save it as 8-bit RGB")
+        image.draft(None, (max(image.width // 8, 1), max(image.height // 8, 1)))
+        image.load()
 
 
 def frame_image(photo: Photo) -> Tensor:

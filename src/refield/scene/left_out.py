@@ -26,6 +26,8 @@ def named(names: Sequence[str]) -> str:
 class LeftOut:
     """Collects what is missing or unreadable while a capture is being loaded."""
 
+    decode: bool = True
+    """look at the pixels too, not only at the headers: finds truncated files before any work is lost on them"""
     missing: list[str] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
 
@@ -35,7 +37,10 @@ class LeftOut:
             self.missing.append(name)
             return None
         try:
-            return images.read_size(image)
+            size = images.read_size(image)
+            if self.decode:
+                images.check_decodes(image)
+            return size
         except InputError:
             self.unreadable.append(name)
             return None

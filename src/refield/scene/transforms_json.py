@@ -27,17 +27,17 @@ ROTATION_TOLERANCE = 1e-3
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # OpenGL camera axes ⇄ OpenCV's
 
 
-def load_transforms(path: Path, *, warn: Warn = log_warning) -> Capture:
+def load_transforms(path: Path, *, warn: Warn = log_warning, decode: bool = True) -> Capture:
     """The capture described by a transforms.json, or by the one in a folder.
 
     Images that are missing, doubled or (up to a tenth) unreadable are left out and named through ``warn``,
-    as is a rescaling of intrinsics to images of another size.
+    as is a rescaling of intrinsics to images of another size. Without ``decode`` only image headers are looked at.
 
     Raises:
         InputError: the file, a frame's key, pose, camera or path is unusable, or no image is left.
     """
     json_path, data = _read(path)
-    entries, frames, left_out = list(_unique(json_path, data, warn)), [], LeftOut()
+    entries, frames, left_out = list(_unique(json_path, data, warn)), [], LeftOut(decode)
     for entry in entries:
         image = _find_image(json_path, entry)
         size = left_out.size_of(image, entry["file_path"])

@@ -1,0 +1,239 @@
+"""The folder in which a field lives: capture, field, visits. Every artefact's place, each put there whole.
+
+    WORK/  refield.json   capture/{transforms.json,images/}   field/{field.safetensors,field.json}
+           visits/001/{change.json, grid_0.npz, masks/, photos/, field.safetensors, report.json, report.html}
+
+``refield.json`` is written last and marks a complete workspace. New artefacts are built in ``.part-*`` and
+renamed, so that what is visible is whole; one process at a time writes (``.lock``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from refield.artefacts import (
+    LOCK,
+    PART,
+    locked,
+    need_space,
+    part_folder,
+    read_tensors,
+    sync,
+    sync_folder,
+    writable,
+    write_tensors,
+)
+from refield.field.radiance import HashField
+from refield.scene.capture import Capture, Frame
+from refield.scene.change import PlacedPhoto, SceneChange
+from refield.scene.change_files import load_change, save_change
+from refield.scene.errors import InputError
+from refield.scene.files import read_json, write_json
+from refield.scene.transforms_json import load_transforms, save_transforms
+
+__all__ = ["Workspace", "load_change", "save_change"]
+
+MARKER = "refield.json"
+FORMAT = 1
+_OURS = (MARKER, "capture", "field", "visits")
+
+
+class Workspace:
+    """An open workspace. Make one by :meth:`building`, find one by :meth:`open`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @staticmethod
+    def open(path: Path) -> Workspace:
+        """An existing workspace.
+
+        Raises:
+            InputError: ``path`` is not one, or of a newer format.
+        """
+        if not (path / MARKER).is_file():
+            what = "is not a refield workspace" if path.exists() else "there is no such workspace"
+            raise InputError(path, what, f"make one with: refield train DATA {path}")
+        version = read_json(path / MARKER).get("format")
+        if version != FORMAT:
+            what = f"has the workspace format {version!r}; this refield reads {FORMAT}"
+            raise InputError(path / MARKER, what, "use the refield that wrote it, or train again")
+        return Workspace(path)
+
+    @staticmethod
+    def refuse_unless_free(path: Path, *, overwrite: bool) -> None:
+        """Check that a workspace may be made at ``path``, before any work.
+
+        Raises:
+            InputError: something is there that we did not write, or a workspace and not ``overwrite``.
+        """
+        if path.exists() and not path.is_dir():
+            raise InputError(path, "is a file, not a folder", "choose another output folder")
+        entries = [p for p in path.iterdir() if not _is_ours_hidden(p)] if path.exists() else []
+        if (path / MARKER).is_file():
+            if not overwrite:
+                what = "already holds a refield workspace"
+                raise InputError(path, what, "choose another folder, or pass --overwrite")
+            return
+        clash = [p.name for p in entries if p.name in _OURS]
+        if clash:
+            what = f"holds {', '.join(clash)} but is not a refield workspace"
+            raise InputError(path, what, "choose another output folder")
+        if entries and not overwrite:
+            what = f"is not empty and not a refield workspace ({entries[0].name}, …)"
+            raise InputError(path, what, "choose an empty output folder, or pass --overwrite to add to it")
+
+    @staticmethod
+    @contextlib.contextmanager
+    def building(path: Path, *, overwrite: bool = False, made_by: str = "train") -> Iterator[Workspace]:
+        """A new workspace under construction: fill it with `keep_capture` and `keep_field`.
+
+        It appears at ``path`` when the block ends well, not at all otherwise. What else lies there stays.
+        """
+        Workspace.refuse_unless_free(path, overwrite=overwrite)
+        existed = path.exists()
+        with writable(path):
+            path.mkdir(parents=True, exist_ok=True)
+        try:
+            with locked(path), part_folder(path) as part:
+                yield Workspace(part)
+                write_json(part / MARKER, {"format": FORMAT, "made_by": made_by})
+                sync(part)
+                _swap_in(path, part)
+        finally:
+            if not existed and not (path / MARKER).exists():
+                shutil.rmtree(path, ignore_errors=True)
+
+    @staticmethod
+    def made_by(path: Path) -> str | None:
+        """The command that made the workspace at ``path``; None if there is none."""
+        return read_json(path / MARKER).get("made_by") if (path / MARKER).is_file() else None
+
+    def keep_capture(self, capture: Capture) -> Capture:
+        """Copy the photos in (named by index), so that the workspace needs nothing from outside; the copy."""
+        size = sum(f.path.stat().st_size for f in capture.frames)
+        need_space(self.path, size)
+        folder = self.path / "capture"
+        copied = replace(capture, frames=_copy_photos(folder, capture.frames))
+        save_transforms(folder / "transforms.json", copied)
+        return copied
+
+    def capture(self) -> Capture:
+        """The photos that the field was fitted to."""
+        return load_transforms(self.path / "capture", decode=False)
+
+    def keep_field(self, field: HashField) -> None:
+        write_tensors(self.path / "field", *field.state())
+
+    def field(self) -> HashField:
+        """The field before any visit."""
+        folder = self.path / "field"
+        tensors, facts = read_tensors(folder)
+        try:
+            return HashField.from_state(tensors, facts)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise InputError(folder, f"does not describe a field ({error})", "train again") from None
+
+    @property
+    def visits(self) -> int:
+        """How many there are; they are numbered from 1 without gaps."""
+        count = 0
+        while self.visit(count + 1).is_dir():
+            count += 1
+        return count
+
+    def visit(self, number: int) -> Path:
+        """The folder of a visit, which need not exist."""
+        return self.path / "visits" / f"{number:03d}"
+
+    def chosen_visit(self, number: int | None) -> int:
+        """``number``, or the latest visit for None; 0 is the state before any.
+
+        Raises:
+            InputError: there is no such visit.
+        """
+        last = self.visits
+        if number is None:
+            return last
+        if not 0 <= number <= last:
+            raise InputError(self.path, f"there is no visit {number}", f"give one of 0 (before) to {last}")
+        return number
+
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[None]:
+        """Hold the lock.
+
+        Raises:
+            InputError: another process holds it, or the folder cannot be written.
+        """
+        with locked(self.path):
+            yield
+
+    @contextlib.contextmanager
+    def new_visit(self) -> Iterator[Path]:
+        """A folder to build the next visit in; it gets its number when the block ends well, or vanishes."""
+        base = self.path / "visits"
+        with writable(base):
+            base.mkdir(exist_ok=True)
+        with part_folder(base) as part:
+            yield part
+            sync(part)
+            part.rename(self.visit(self.visits + 1))
+            sync_folder(base)
+
+    def keep_change(self, folder: Path, change: SceneChange) -> SceneChange:
+        """Copy the used photos into a visit's folder and write the change; the change with the copies."""
+        frames = _copy_photos(folder / "photos", change.frames)
+        if frames:
+            save_transforms(folder / "photos" / "transforms.json", Capture(frames, held_out_every=0))
+        rest = iter(frames)
+        photos = tuple(p if p.frame is None else _photo_at(p, next(rest)) for p in change.photos)
+        kept = replace(change, photos=photos)
+        save_change(folder, kept)
+        return kept
+
+    def change(self, number: int, capture: Capture | None = None) -> SceneChange:
+        """What changed at a visit."""
+        return load_change(self.visit(number), capture)
+
+
+def _copy_photos(folder: Path, frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    """The same frames with their image files at ``folder/images/0000.png`` and on."""
+    out = []
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for i, frame in enumerate(frames):
+        name = f"images/{i:04d}{frame.path.suffix.lower()}"
+        shutil.copyfile(frame.path, folder / name)
+        out.append(replace(frame, path=folder / name))
+    return tuple(out)
+
+
+def _photo_at(photo: PlacedPhoto, frame: Frame) -> PlacedPhoto:
+    return replace(photo, frame=frame)
+
+
+def _is_ours_hidden(path: Path) -> bool:
+    return path.name == LOCK or path.name.startswith(PART)
+
+
+def _swap_in(path: Path, part: Path) -> None:
+    """Move a finished workspace's entries from ``part`` to ``path``; undone if anything stops it half-way."""
+    old = part / "old"
+    old.mkdir()
+    moves = [(path / name, old / name) for name in _OURS]
+    moves += [(part / name, path / name) for name in reversed(_OURS)]  # the marker goes first and comes last
+    done: list[tuple[Path, Path]] = []
+    try:
+        for source, target in moves:
+            if source.exists():
+                source.rename(target)
+                done.append((source, target))
+        sync_folder(path)
+    except BaseException:
+        for source, target in reversed(done):
+            target.rename(source)
+        raise
