@@ -10,6 +10,7 @@ renamed, so that what is visible is whole; one process at a time writes (``.lock
 from __future__ import annotations
 
 import contextlib
+import math
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -126,8 +127,11 @@ class Workspace:
         """The photos that the field was fitted to."""
         return load_transforms(self.path / "capture", decode=False)
 
-    def keep_field(self, field: HashField) -> None:
-        write_tensors(self.path / "field", *field.state())
+    def keep_field(self, field: HashField, psnr: float = math.nan) -> None:
+        """Write the fitted field and, if known, its PSNR on held-out pixels (dB)."""
+        tensors, facts = field.state()
+        facts["held_out_psnr"] = psnr if math.isfinite(psnr) else None
+        write_tensors(self.path / "field", tensors, facts)
 
     def field(self) -> HashField:
         """The field before any visit."""

@@ -42,7 +42,13 @@ class Camera:
         """The same lens seen on a sensor resampled to ``width`` x ``height`` pixels."""
         sx, sy = width / self.width, height / self.height
         return replace(
-            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
         )
 
     def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:

@@ -62,7 +62,7 @@ class OccupancyGrid:
         return torch.stack([points.amin(0) - half_cell, points.amax(0) + half_cell])
 
     def dilated(self, factor: float) -> OccupancyGrid:
-        """M_out (§10.1.3): grown by the same distance on every side until its box is ``factor`` times as large.
+        """M_out (§10.1.3): grown equally on every side until its box is ``factor`` times as large.
 
         The distance is half of (factor - 1) times the mean side of the tight box.
         """
@@ -116,7 +116,9 @@ class ObjectChange:
 
     def __post_init__(self) -> None:
         if (self.kind == "moved") != (self.new_from_old is not None):
-            raise ValueError(f"new_from_old belongs to a moved object, and only to one (kind is {self.kind!r})")
+            raise ValueError(
+                f"new_from_old belongs to a moved object, and only to one (kind is {self.kind!r})"
+            )
 
     @property
     def old_from_new(self) -> Tensor:

@@ -27,9 +27,11 @@ class LeftOut:
     """Collects what is missing or unreadable while a capture is being loaded."""
 
     decode: bool = True
-    """look at the pixels too, not only at the headers: finds truncated files before any work is lost on them"""
+    """look at the pixels too, not only at the headers: finds truncated files before work is lost on them"""
     missing: list[str] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
+    reason: str = ""
+    """what is wrong with the first unreadable one"""
 
     def size_of(self, image: Path | None, name: str) -> tuple[int, int] | None:
         """The image's (width, height), or None if it has to be left out, which is noted."""
@@ -41,8 +43,9 @@ class LeftOut:
             if self.decode:
                 images.check_decodes(image)
             return size
-        except InputError:
+        except InputError as error:
             self.unreadable.append(name)
+            self.reason = self.reason or error.what
             return None
 
     def report(self, where: Path, total: int, warn: Warn) -> None:
@@ -56,8 +59,8 @@ class LeftOut:
             what = f"none of its {total} images exists ({named(missing)})"
             raise InputError(where, what, "put the images beside it, or correct their paths")
         if len(unreadable) > UNREADABLE_SHARE * total:
-            what = f"{len(unreadable)} of {total} images cannot be read ({named(unreadable)})"
+            what = f"{len(unreadable)} of {total} images cannot be read ({named(unreadable)}: {self.reason})"
             raise InputError(where, what, "replace them or remove their frames")
-        for names, fault in ((missing, "missing"), (unreadable, "unreadable")):
+        for names, fault in ((missing, "missing"), (unreadable, f"unreadable ({self.reason})")):
             if names:
                 warn(f"{where}: {len(names)} of {total} images are {fault} and left out: {named(names)}")

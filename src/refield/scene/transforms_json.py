@@ -31,7 +31,7 @@ def load_transforms(path: Path, *, warn: Warn = log_warning, decode: bool = True
     """The capture described by a transforms.json, or by the one in a folder.
 
     Images that are missing, doubled or (up to a tenth) unreadable are left out and named through ``warn``,
-    as is a rescaling of intrinsics to images of another size. Without ``decode`` only image headers are looked at.
+    as is a rescaling of intrinsics to images of another size. Without ``decode`` only headers are looked at.
 
     Raises:
         InputError: the file, a frame's key, pose, camera or path is unusable, or no image is left.

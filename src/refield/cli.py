@@ -1,0 +1,88 @@
+"""The command line: names the commands, and turns what goes wrong into an exit code.
+
+0 done · 1 a fault of ours (with its traceback) · 2 input that cannot be used (one line) · 130 interrupted.
+Everything heavy is imported only once a command is chosen.
+"""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import signal
+import sys
+from collections.abc import Sequence
+from types import FrameType
+
+from refield.scene.errors import InputError
+
+COMMANDS = {
+    "demo": "sample capture → field → update → report; no downloads, on a CPU",
+    "train": "photos with camera poses → a field in a workspace",
+    "update": "a few new photos → what changed, and the field brought up to date",
+    "render": "pictures from any camera, before or after",
+    "evaluate": "PSNR and SSIM on photos the field has never seen",
+    "synth": "path-trace a world that is known exactly (needs the extra 'synth')",
+}
+INPUT, INTERRUPTED = 2, 130
+_DISK = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM, errno.EDQUOT)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    previous = signal.signal(signal.SIGTERM, _terminate)  # so that half-built folders are cleared away
+    try:
+        return _command(arguments)
+    except InputError as error:
+        return _fail(str(error), INPUT)
+    except KeyboardInterrupt:
+        return _fail("interrupted; what was complete before is untouched", INTERRUPTED)
+    except MemoryError:
+        return _fail("out of memory; scale the photos down or give fewer", 1)
+    except OSError as error:
+        if error.errno not in _DISK:
+            raise
+        what = f"{error.filename or 'the disk'}: {error.strerror}; check permissions and free space"
+        return _fail(what, INPUT)
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _command(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_help())
+        return 0 if arguments else INPUT
+    if arguments[0] == "--version":
+        from refield import __version__
+
+        print(f"refield {__version__}")
+        return 0
+    name = arguments[0]
+    if name not in COMMANDS:
+        return _fail(f"{name!r} is no command; choose one of {', '.join(COMMANDS)}", INPUT)
+    import tyro
+
+    module = importlib.import_module(f"refield.commands.{name}")
+    options = tyro.cli(getattr(module, name.capitalize()), args=arguments[1:], prog=f"refield {name}")
+    module.run(options)
+    return 0
+
+
+def _help() -> str:
+    lines = [f"  {name:10} {what}" for name, what in COMMANDS.items()]
+    head = "refield keeps a radiance field true to a scene whose objects move.\n\nusage: refield COMMAND …\n"
+    return "\n".join([head, *lines, "\nrefield COMMAND --help shows a command's options."])
+
+
+def _fail(message: str, code: int) -> int:
+    one_line = " ".join(message.split())
+    print(f"refield: {one_line}", file=sys.stderr)
+    return code
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(128 + number)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,68 @@
+"""``refield evaluate WORK EVAL``: how well the field shows photos that it has never seen (§11.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import Positional
+
+from refield.artefacts import writable
+from refield.commands.clock import Clock
+from refield.evaluate import EvaluateConfig, Report, Scores, evaluate
+from refield.history import state
+from refield.scene.files import write_json
+from refield.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare renderings with photos: PSNR and SSIM, inside the masks and on untouched pixels."""
+
+    work: Positional[Path]
+    """the workspace"""
+    eval: Positional[Path]
+    """a folder with transforms.json, images/, and masks_in/ and masks_out/ (PNGs with the images' names)"""
+    visit: int | None = None
+    """the state to measure: 0 is before any visit; the latest by default, beside the state before any"""
+    out: Path | None = None
+    """a JSON file for the numbers"""
+    config: EvaluateConfig = field(default_factory=EvaluateConfig)
+
+
+def run(options: Evaluate) -> None:
+    clock = Clock()
+    workspace = Workspace.open(options.work)
+    visit = workspace.chosen_visit(options.visit)
+    clock.stage(f"load the field as of visit {visit}")
+    now = state(workspace, visit)
+    before = state(workspace, 0) if visit else None
+    clock.stage("evaluate")
+    report = evaluate(now, options.eval, old=before, config=options.config)
+    clock.stop()
+    if options.out is not None:
+        with writable(options.out):
+            write_json(options.out, report.to_dict())
+    Console().print(table(report, f"visit {visit}"))
+
+
+def table(report: Report, name: str) -> Table:
+    """One row per view and one for all, each number beside the old field's."""
+    columns = [f.name for f in fields(Scores) if getattr(report.pooled, f.name) is not None]
+    out = Table(title=f"{name} (in brackets: before)" if report.pooled_before else name)
+    out.add_column("view")
+    for column in columns:
+        out.add_column(column.replace("_", "-"), justify="right")
+    rows = [(v.name, v.scores, v.scores_before) for v in report.views]
+    for label, scores, before in [*rows, ("all", report.pooled, report.pooled_before)]:
+        out.add_row(label, *(_cell(scores, before, column) for column in columns))
+    return out
+
+
+def _cell(scores: Scores, before: Scores | None, column: str) -> str:
+    digits = 3 if column.startswith(("ssim", "lpips")) else 2
+    values = [getattr(s, column) for s in (scores, before) if s is not None]
+    shown = ["-" if v is None else f"{v:.{digits}f}" for v in values]
+    return shown[0] if len(shown) == 1 else f"{shown[0]} ({shown[1]})"

@@ -1,0 +1,70 @@
+"""A visit's report: the pictures and numbers of one update, gathered for `refield.report`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from refield.commands.clock import Clock
+from refield.evaluate import Report
+from refield.field.radiance import Field
+from refield.field.render import render_frame
+from refield.report import Comparison, VisitReport
+from refield.scene.change import SceneChange
+from refield.scene.images import frame_image
+
+
+def page(
+    title: str,
+    change: SceneChange,
+    fields: tuple[Field, Field | None],
+    clock: Clock,
+    evaluation: Report | None,
+    facts: Mapping[str, float | str],
+) -> VisitReport:
+    """``fields`` are the old one and the updated one (None if nothing changed)."""
+    return VisitReport(
+        title,
+        change,
+        photos=_photos(change, *fields),
+        seconds=dict(clock.seconds),
+        evaluation=None if evaluation is None else evaluation.to_dict(),
+        evaluation_views=() if evaluation is None else evaluation_views(evaluation),
+        facts=dict(facts),
+        warnings=tuple(clock.warnings),
+    )
+
+
+def evaluation_views(evaluation: Report) -> tuple[Comparison, ...]:
+    """The evaluation's pictures; without an update the old field's are its only ones."""
+    return tuple(
+        Comparison(
+            name=v.name,
+            photo=v.truth,
+            before=v.render if v.render_before is None else v.render_before,
+            after=None if v.render_before is None else v.render,
+            mask_in=v.mask_in,
+            mask_out=v.mask_out,
+        )
+        for v in evaluation.views
+    )
+
+
+def _photos(change: SceneChange, old: Field, new: Field | None) -> tuple[Comparison, ...]:
+    out, used = [], 0
+    for photo in change.photos:
+        frame = photo.frame
+        if frame is None:
+            out.append(Comparison(photo.name, None))
+            continue
+        out.append(
+            Comparison(
+                name=photo.name,
+                photo=frame_image(frame),
+                before=render_frame(old, frame).rgb,
+                after=None if new is None else render_frame(new, frame).rgb,
+                mask_in=change.masks_in[used] if change.masks_in else None,
+                mask_out=change.masks_out[used] if change.masks_out else None,
+            )
+        )
+        used += 1
+    return tuple(out)

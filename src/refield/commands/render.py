@@ -1,0 +1,81 @@
+"""``refield render WORK --cameras FILE --out DIR [--visit N]``: pictures of the scene as it was or is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from refield.artefacts import writable
+from refield.commands.clock import Clock
+from refield.field.radiance import Field
+from refield.field.render import render_frame
+from refield.history import state
+from refield.scene.capture import Frame
+from refield.scene.errors import InputError
+from refield.scene.images import is_ours, write_image
+from refield.scene.left_out import named
+from refield.scene.transforms_json import load_cameras, stem
+from refield.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render the views of a transforms.json, one PNG per frame with the frame's file name."""
+
+    work: Positional[Path]
+    """the workspace"""
+    cameras: Path
+    """a transforms.json (its images need not exist), in the world of the workspace's photos"""
+    out: Path
+    """the folder for the pictures"""
+    visit: int | None = None
+    """the state to show: 0 is before any visit; the latest by default"""
+    overwrite: bool = False
+    """replace pictures in ``out`` that refield did not write"""
+
+
+def run(options: Render) -> None:
+    clock = Clock()
+    workspace = Workspace.open(options.work)
+    visit = workspace.chosen_visit(options.visit)
+    frames = load_cameras(options.cameras, warn=clock.warn)
+    paths = output_paths(options.cameras, frames, options.out, overwrite=options.overwrite)
+    clock.stage(f"load the field as of visit {visit}")
+    render(state(workspace, visit), frames, paths, clock)
+    print(f"{len(paths)} pictures in {options.out}")
+
+
+def render(field: Field, frames: list[Frame], paths: list[Path], clock: Clock) -> None:
+    """Write one picture per frame."""
+    clock.stage(f"render {len(frames)} views")
+    for frame, path in zip(frames, paths):
+        picture = render_frame(field, frame).rgb
+        with writable(path):
+            write_image(path, picture)
+    clock.stop()
+
+
+def output_paths(cameras: Path, frames: list[Frame], out: Path, *, overwrite: bool) -> list[Path]:
+    """Where each frame's picture goes.
+
+    Raises:
+        InputError: two frames share a name, a name is none, or a picture that is not ours would be replaced.
+    """
+    stems = [stem(frame) for frame in frames]
+    twice = sorted({s for s in stems if stems.count(s) > 1})
+    if twice:
+        what = f"several frames would be written as {named([s + '.png' for s in twice])}"
+        raise InputError(cameras, what, "give every frame its own file name")
+    unnamed = [f.name for f, s in zip(frames, stems) if s in ("", ".", "..")]
+    if unnamed:
+        raise InputError(cameras, f"the frame {unnamed[0]!r} has no file name", "name its image")
+    if out.exists() and not out.is_dir():
+        raise InputError(out, "is a file, not a folder", "choose another output folder")
+    paths = [out / f"{s}.png" for s in stems]
+    foreign = [p.name for p in paths if p.exists() and not is_ours(p)]
+    if foreign and not overwrite:
+        what = f"holds pictures that refield did not write ({named(foreign)})"
+        raise InputError(out, what, "choose another output folder, or pass --overwrite")
+    return paths

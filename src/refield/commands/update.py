@@ -1,0 +1,130 @@
+"""``refield update WORK PHOTOS``: a few new photos → what changed, and the field of the scene as it is."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from refield.commands.clock import Clock
+from refield.commands.page import page
+from refield.estimate.recipe import EstimateConfig, estimate_change
+from refield.evaluate import Report, evaluate
+from refield.field.radiance import Field
+from refield.history import changed_visits, retouched, state, untouched_psnr
+from refield.report import summary, write_report
+from refield.scene.capture import Capture
+from refield.scene.change import SceneChange
+from refield.scene.errors import InputError
+from refield.scene.load import load_new_photos
+from refield.update.composite import UpdatedField
+from refield.update.config import UpdateConfig
+from refield.update.train import update_field
+from refield.workspace import Workspace
+
+MOST_LOST = 0.2
+"""dB that the unchanged pixels of the new photos may lose before an update is refused"""
+
+
+@dataclass(frozen=True)
+class Update:
+    """Find out from a few new photos what moved, left or arrived, and bring the field up to date."""
+
+    work: Positional[Path]
+    """the workspace"""
+    photos: Positional[Path]
+    """the new photos: a transforms.json or its folder, with poses in the world of the old ones"""
+    evaluation: Path | None = None
+    """a folder of further photos (transforms.json, images/, masks_in/, masks_out/) to measure by"""
+    estimate: EstimateConfig = field(default_factory=EstimateConfig)
+    update: UpdateConfig = field(default_factory=UpdateConfig)
+
+
+@dataclass(frozen=True)
+class Visit:
+    """What an update has made."""
+
+    folder: Path
+    change: SceneChange
+    evaluation: Report | None
+
+    @property
+    def html(self) -> Path:
+        return self.folder / "report.html"
+
+
+def run(options: Update) -> None:
+    clock = Clock()
+    visit = update(options, clock)
+    print(summary(visit.change) if visit.change.objects else "nothing changed")
+    if visit.change.why:
+        print(visit.change.why)
+    print(f"report: {visit.html}")
+
+
+def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | None = None) -> Visit:
+    """Estimate, update, judge, report: one visit, published whole or not at all.
+
+    Raises:
+        InputError: no workspace, unusable photos, or an update that would make the field worse.
+    """
+    workspace = Workspace.open(options.work)
+    frames = load_new_photos(options.photos, workspace.capture(), warn=clock.warn)
+    with workspace.writing(), tempfile.TemporaryDirectory(prefix="refield-") as scratch:
+        clock.stage("load the field")
+        number = workspace.visits
+        old = state(workspace, number)
+        capture = _capture_now(workspace, number, old, clock, Path(scratch))
+        change = estimate_change(capture, old, frames, options.estimate, on_stage=clock.stage)
+        _need_a_photo(options.photos, change)
+        new = _updated(capture, old, change, options.update, clock)
+        clock.stage("report")
+        evaluation = None
+        if options.evaluation is not None:
+            evaluation = evaluate(new or old, options.evaluation, old=old if new else None)
+        with workspace.new_visit() as folder:
+            workspace.keep_change(folder, change)
+            if new is not None:
+                new.save(folder)
+            clock.stop()
+            title = f"{options.work.resolve().name}, visit {number + 1}"
+            write_report(folder, page(title, change, (old, new), clock, evaluation, facts or {}))
+    return Visit(workspace.visit(number + 1), change, evaluation)
+
+
+def _capture_now(workspace: Workspace, visit: int, now: Field, clock: Clock, scratch: Path) -> Capture:
+    capture = workspace.capture()
+    if not changed_visits(workspace, visit):
+        return capture
+    clock.stage("bring the old photos up to the last visit")
+    return retouched(capture, workspace.field(), now, scratch)
+
+
+def _need_a_photo(photos: Path, change: SceneChange) -> None:
+    if not change.frames:
+        reasons = "; ".join(f"{p.name}: {p.why}" for p in change.photos)
+        raise InputError(photos, f"none of the photos could be used ({reasons})", "do they show this scene?")
+
+
+def _updated(
+    capture: Capture, old: Field, change: SceneChange, config: UpdateConfig, clock: Clock
+) -> UpdatedField | None:
+    """The updated field, None if nothing changed.
+
+    Raises:
+        InputError: it would show the unchanged pixels of the new photos worse than the old field does.
+    """
+    if not change.objects:
+        return None
+    with clock.training("update") as line:
+        new = update_field(capture, old, change, config, on_stage=clock.stage, on_progress=line)
+    clock.stage("judge the update")
+    masks = [a | b for a, b in zip(change.masks_in, change.masks_out)]
+    before, after = untouched_psnr([old, new], change.frames, masks)
+    if after < before - MOST_LOST:
+        what = f"the update would make unchanged pixels {before - after:.1f} dB worse and is not kept"
+        raise InputError("update", what, "check the new photos' poses and light, or give more photos")
+    return new

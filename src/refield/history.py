@@ -1,0 +1,86 @@
+"""The states a workspace has been in: state 0 is the fitted field, state N the field after visit N.
+
+Every visit that changed something wraps the field before it; an updated field is a field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from refield.artefacts import TENSORS
+from refield.field.radiance import Field
+from refield.field.render import render_camera, render_many
+from refield.scene.capture import Capture, Frame, camera_rays
+from refield.scene.images import frame_image, write_image
+from refield.update.composite import UpdatedField
+from refield.workspace import Workspace
+
+_SHOWS = 0.04
+"""A rendered pixel that differs by more between two states shows what changed."""
+_COARSE = 2  # the comparison is made at half of the photos' size
+
+
+def changed_visits(workspace: Workspace, visit: int) -> list[int]:
+    """The visits up to ``visit`` that changed the field."""
+    return [n for n in range(1, visit + 1) if (workspace.visit(n) / TENSORS).is_file()]
+
+
+def state(workspace: Workspace, visit: int) -> Field:
+    """The field as it was after ``visit`` (0: before any).
+
+    Raises:
+        InputError: an artefact is missing or damaged.
+    """
+    field: Field = workspace.field()
+    for number in changed_visits(workspace, visit):
+        field = UpdatedField.load(workspace.visit(number), field, workspace.change(number))
+    return field
+
+
+def retouched(capture: Capture, before: Field, now: Field, folder: Path) -> Capture:
+    """The capture as if taken ``now``: where the photos show what has changed since, the field's picture stands.
+
+    The photos are from ``before``; an update must not learn from them what an earlier visit has put right.
+    Written as PNGs into ``folder``.
+    """
+    frames = []
+    for i, frame in enumerate(capture.frames):
+        mask = _differs(frame, before, now)
+        if not mask.any():
+            frames.append(frame)
+            continue
+        image = frame_image(frame).float() / 255
+        rays = camera_rays(frame.camera, frame.world_from_cam)
+        image[mask] = render_many(now, rays[mask.reshape(-1)]).rgb
+        path = folder / f"{i:04d}.png"
+        write_image(path, image)
+        frames.append(replace(frame, path=path))
+    return replace(capture, frames=tuple(frames))
+
+
+def _differs(frame: Frame, before: Field, now: Field) -> Tensor:
+    """(H, W) bool: where two states look different from a frame, with a margin of a coarse pixel."""
+    camera = frame.camera
+    coarse = camera.scaled(max(camera.width // _COARSE, 1), max(camera.height // _COARSE, 1))
+    shown = [render_camera(f, coarse, frame.world_from_cam).rgb for f in (before, now)]
+    mask = ((shown[0] - shown[1]).abs().amax(-1) > _SHOWS).float()[None, None]
+    mask = torch.nn.functional.max_pool2d(mask, 3, stride=1, padding=1)
+    return torch.nn.functional.interpolate(mask, (camera.height, camera.width))[0, 0] > 0.5
+
+
+def untouched_psnr(fields: Sequence[Field], frames: Sequence[Frame], masks: Sequence[Tensor]) -> list[float]:
+    """PSNR (dB) of each field over the pixels of ``frames`` that are in no mask, all frames pooled."""
+    errors, count = [0.0] * len(fields), 0
+    for frame, mask in zip(frames, masks):
+        truth = frame_image(frame).reshape(-1, 3).float() / 255
+        chosen = (~mask.reshape(-1)).nonzero()[:, 0]
+        rays = camera_rays(frame.camera, frame.world_from_cam)[chosen]
+        count += 3 * len(chosen)
+        for k, field in enumerate(fields):
+            errors[k] += float((render_many(field, rays).rgb - truth[chosen]).square().sum())
+    return [float(-10 * torch.log10(torch.tensor(max(e / max(count, 1), 1e-12)))) for e in errors]
