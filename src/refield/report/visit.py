@@ -75,8 +75,10 @@ def turn(new_from_old: Tensor) -> tuple[float, list[float]]:
 
 
 def object_shift(change: ObjectChange) -> list[float] | None:
-    """How far a moved object's centre went, (3,) world units: unlike T's own last column it does not depend on
-    where the world's origin lies."""
+    """How far a moved object's centre went, (3,) world units.
+
+    Unlike T's own last column it does not depend on where the world's origin lies.
+    """
     if change.new_from_old is None:
         return None
     centre = change.grid.tight_aabb().mean(0).double()
@@ -85,8 +87,10 @@ def object_shift(change: ObjectChange) -> list[float] | None:
 
 
 def uncertainty(change: ObjectChange) -> tuple[float, float] | None:
-    """Standard deviations of a pose change from its covariance: of the object's centre (world units, root of the
-    summed variances) and of the turn (degrees)."""
+    """Standard deviations of a pose change: of the object's centre (world units) and of the turn (degrees).
+
+    Each is the root of the summed variances along the three axes.
+    """
     if change.covariance is None or change.new_from_old is None:
         return None
     cov = change.covariance.double()
