@@ -1,0 +1,44 @@
+"""Choices of the update (§4.1, §10.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class UpdateConfig:
+    """How the helper is trained and shown."""
+
+    dilation: float = 2.0
+    """The helper trains in each object's grid, its box this many times as large (§10.1.3: 2 to 3)."""
+    shown: float = 1.25
+    """And is shown in this much of it; further out the old field knows better."""
+    shadow: float = 0.01
+    """Old photos: pixels this near to an object's mask, in image widths, may hold its shadow (§10.1.3)."""
+    far: float = 0.15
+    """Old photos: pixels further away than this, in image widths, do not teach (§10.1.3)."""
+    relight: bool = True
+    """Fit how the light on unchanged surfaces changed."""
+    steps: int = 300
+    """of gradient descent"""
+    max_seconds: float = 10.0
+    """for all of the steps; the learning rate follows whichever of steps and seconds is further on"""
+    samples: int = 32768
+    """of the helper in a step"""
+    sparse_share: float = 0.5
+    """of each batch's rays drawn from the new photos"""
+    rate: float = 1e-2
+    """Adam's learning rate, held for the first half, then brought down to a thirtieth"""
+    distortion: float = 1e-2
+    """weight of the distortion loss"""
+    emptiness: float = 2e-2
+    """weight of the colour that comes from deep inside what an object left: solid things stood in nothing"""
+    held_out: int = 20
+    """every so-many-th pixel that could teach is kept to judge by"""
+    check_every: int = 50
+    """steps between looks at the held-out pixels"""
+    patience: int = 3
+    """looks without ``least_gain`` after which training stops"""
+    least_gain: float = 0.03
+    """dB"""
+    seed: int = 0

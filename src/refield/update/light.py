@@ -1,0 +1,163 @@
+"""How the light on unchanged surfaces changed: shadows that left, came, or moved along with an object.
+
+A shadow changes the colour of a surface by a factor, and nothing of its geometry. `Relighting` is that factor on a
+lattice, 1 where nothing is known against it. It is fitted in closed form from the new photos and kept only where
+photos that were left out of a fit confirm it. Letters: P pixels, C lattice nodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from refield.field.warp import inside_box
+
+
+@dataclass(frozen=True)
+class Relighting:
+    """Colour factors on a lattice in a world box."""
+
+    aabb: Tensor
+    """(2, 3) float32, corner to corner of the nodes"""
+    log_gain: Tensor
+    """(X, Y, Z, 3) float32, natural logarithm of the factor of each channel"""
+
+    def gain(self, x: Tensor) -> Tensor:
+        """World points (S, 3) -> factors (S, 3); 1 outside the box."""
+        lo, hi = self.aabb
+        unit = (x - lo) / (hi - lo) * 2 - 1
+        volume = self.log_gain.permute(3, 2, 1, 0)[None]
+        out = functional.grid_sample(volume, unit[None, :, None, None], padding_mode="border", align_corners=True)
+        factor = torch.exp(out.reshape(3, -1).T)
+        return torch.where(inside_box(x.detach(), self.aabb)[:, None], factor, torch.ones_like(factor))
+
+    def applied(self, x: Tensor, rgb: Tensor) -> Tensor:
+        """World points (S, 3), colours (S, 3) -> colours in the new light (S, 3) in [0, 1]."""
+        near = inside_box(x.detach(), self.aabb).nonzero()[:, 0]
+        if len(near) == 0:
+            return rgb
+        return rgb.index_copy(0, near, (rgb[near] * self.gain(x[near])).clamp(0, 1))
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """The same surface points in the new photos and in the old field."""
+
+    x: Tensor
+    """(P, 3) world"""
+    photo: Tensor
+    """(P, 3) in [0, 1], in the old exposure"""
+    rendered: Tensor
+    """(P, 3) in [0, 1]"""
+    view: Tensor
+    """(P,) int64: the new photo's index"""
+
+    def __getitem__(self, chosen: Tensor) -> Sightings:
+        return Sightings(self.x[chosen], self.photo[chosen], self.rendered[chosen], self.view[chosen])
+
+
+_COARSER = (4, 2, 1)  # lattice spacings of the pyramid, in the finest
+_HOLD = 2.0  # how many pixels' worth of evidence each level grants to the coarser one
+_MOST = 3.0  # factors are held within [1 / this, this]
+
+
+def fit_light(seen: Sightings, box: Tensor, spacing: float) -> Relighting | None:
+    """Least-squares factors on a lattice of ``spacing`` (world units) in a world ``box`` (2, 3).
+
+    None if no part of it is confirmed: each photo's pixels must be explained better by the factors fitted to the
+    *other* photos than by none.
+    """
+    inside = inside_box(seen.x, box)
+    seen = seen[inside.nonzero()[:, 0]]
+    views = seen.view.unique()
+    if len(views) < 2:
+        return None
+    kept = _confirmed(seen, views, box, spacing)
+    if not kept.any():
+        return None
+    gain = _pyramid(seen, box, spacing)
+    fade = _smoothed(_without_border(kept.float())[..., None])
+    return Relighting(box, torch.log(gain) * fade)
+
+
+def _confirmed(seen: Sightings, views: Tensor, box: Tensor, spacing: float) -> Tensor:
+    """Nodes (X, Y, Z) bool around which the factors of the other photos lower a photo's error."""
+    shape = _shape(box, spacing)
+    gains, errors = [], []
+    for view in views:
+        out = seen.view == view
+        gain = _pyramid(seen[~out], box, spacing)
+        left_out = seen[out]
+        factor = _gather(gain, left_out.x, box)
+        before = (left_out.photo - left_out.rendered).square().sum(-1)
+        after = (left_out.photo - (left_out.rendered * factor).clamp(0, 1)).square().sum(-1)
+        gains.append(_scatter(torch.stack([before, after], -1), left_out.x, box, shape))
+        errors.append(len(left_out))
+    before, after = _smoothed(sum(gains[1:], gains[0])).unbind(-1)
+    return (after < 0.9 * before) & (before > 1e-6)
+
+
+def _pyramid(seen: Sightings, box: Tensor, spacing: float) -> Tensor:
+    """Factors (X, Y, Z, 3), each level held to the coarser one."""
+    gain = None
+    for coarser in _COARSER:
+        shape = _shape(box, spacing * coarser)
+        top = _scatter(seen.photo * seen.rendered, seen.x, box, shape)
+        bottom = _scatter(seen.rendered.square(), seen.x, box, shape)
+        hold = _HOLD * float(seen.rendered.square().mean())
+        prior = torch.ones(*shape, 3) if gain is None else _resized(gain, shape)
+        gain = ((top + hold * prior) / (bottom + hold)).clamp(1 / _MOST, _MOST)
+    assert gain is not None
+    return gain
+
+
+def _shape(box: Tensor, spacing: float) -> tuple[int, int, int]:
+    x, y, z = ((box[1] - box[0]) / spacing).ceil().long().clamp(2, 96).tolist()
+    return x + 1, y + 1, z + 1
+
+
+def _corners(x: Tensor, box: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Rows (P, 8) of the flat lattice around each point, and trilinear weights (P, 8)."""
+    size = torch.tensor(shape[:3])
+    p = (x - box[0]) / (box[1] - box[0]) * (size - 1)
+    base = p.floor().long().clamp_min(0).minimum(size - 2)
+    f = p - base
+    offsets = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
+    ijk = base[:, None] + offsets
+    rows = (ijk[..., 0] * size[1] + ijk[..., 1]) * size[2] + ijk[..., 2]
+    return rows, torch.where(offsets.bool(), f[:, None], 1 - f[:, None]).prod(-1)
+
+
+def _scatter(values: Tensor, x: Tensor, box: Tensor, shape: tuple[int, int, int]) -> Tensor:
+    """Values (P, C) shared out among the nodes around their points -> (X, Y, Z, C)."""
+    rows, w = _corners(x, box, shape)
+    flat = values.new_zeros(shape[0] * shape[1] * shape[2], values.shape[1])
+    flat.index_add_(0, rows.reshape(-1), (w[..., None] * values[:, None]).reshape(-1, values.shape[1]))
+    return flat.reshape(*shape, -1)
+
+
+def _gather(lattice: Tensor, x: Tensor, box: Tensor) -> Tensor:
+    """Trilinear values (P, C) of a lattice (X, Y, Z, C)."""
+    rows, w = _corners(x, box, lattice.shape[:3])
+    return (lattice.reshape(-1, lattice.shape[-1])[rows] * w[..., None]).sum(1)
+
+
+def _resized(lattice: Tensor, shape: tuple[int, int, int]) -> Tensor:
+    volume = lattice.permute(3, 0, 1, 2)[None]
+    return functional.interpolate(volume, shape, mode="trilinear", align_corners=True)[0].permute(1, 2, 3, 0)
+
+
+def _smoothed(lattice: Tensor) -> Tensor:
+    """Mean of the 3 x 3 x 3 nodes around each, (X, Y, Z, C)."""
+    volume = lattice.permute(3, 0, 1, 2)[None]
+    return functional.avg_pool3d(volume, 3, 1, 1, count_include_pad=False)[0].permute(1, 2, 3, 0)
+
+
+def _without_border(lattice: Tensor) -> Tensor:
+    """Zero on the two outermost layers, so that the light passes into the unlit world without an edge."""
+    out = torch.zeros_like(lattice)
+    out[2:-2, 2:-2, 2:-2] = lattice[2:-2, 2:-2, 2:-2]
+    return out

@@ -1,0 +1,72 @@
+"""Where the old field no longer speaks: the move-out region M_out and its exceptions (§10.1.2, §10.1.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from refield.field.encoding import Contraction
+from refield.field.sampling import OccupancySampler
+from refield.field.warp import inside_box, outline
+from refield.scene.capture import Rays
+from refield.scene.change import OccupancyGrid, SceneChange
+
+
+@dataclass(frozen=True)
+class Region:
+    """A union of grids in the world."""
+
+    grids: tuple[OccupancyGrid, ...]
+
+    @cached_property
+    def boxes(self) -> tuple[Tensor, ...]:
+        """A (2, 3) world box around each grid."""
+        return tuple(outline(g) for g in self.grids)
+
+    @property
+    def box(self) -> Tensor:
+        """(2, 3) around them all. Raises ValueError if there is none."""
+        if not self.grids:
+            raise ValueError("an empty region has no box")
+        boxes = torch.stack(self.boxes)
+        return torch.stack([boxes[:, 0].amin(0), boxes[:, 1].amax(0)])
+
+    def contains(self, x: Tensor) -> Tensor:
+        """World points (..., 3) -> (...,) bool."""
+        flat = x.detach().reshape(-1, 3)
+        found = torch.zeros(len(flat), dtype=torch.bool, device=x.device)
+        for grid, box in zip(self.grids, self.boxes):
+            near = (inside_box(flat, box) & ~found).nonzero()[:, 0]
+            if len(near):
+                found[near] = grid.contains(flat[near])
+        return found.reshape(x.shape[:-1])
+
+    def sampler(self, step: float, resolution: int = 128) -> OccupancySampler:
+        """Looks everywhere in the region and nowhere else; its core cube is the region's bounding cube."""
+        box = self.box
+        space = Contraction(box.mean(0), float((box[1] - box[0]).max()) / 2 * 1.02)
+        empty = OccupancySampler(space, torch.zeros(resolution, resolution, resolution, dtype=torch.uint8), step)
+        cells = torch.arange(resolution**3)
+        inside = torch.cat([self.contains(empty.points_in(c, jitter=False)) for c in cells.split(1 << 18)])
+        return OccupancySampler(space, inside.to(torch.uint8).reshape(empty.grid.shape), step)
+
+
+def meets(sampler: OccupancySampler, rays: Rays) -> Tensor:
+    """Whether each of N rays passes an occupied cell, (N,) bool."""
+    return sampler(rays).ray_offsets.diff() > 0
+
+
+def move_out(change: SceneChange, factor: float) -> Region:
+    """M_out: every object's grid, its box dilated ``factor`` times (§10.1.3; 2 to 3). An added object's is where it is.
+
+    What moved in there is taken out of it where the region is used: move-in wins (§10.1.2).
+    """
+    return Region(tuple(o.grid.dilated(factor) if factor > 1 else o.grid for o in change.objects))
+
+
+def carved(change: SceneChange) -> Region:
+    """What was inside the objects that moved or left: nothing of the old field is true there any more."""
+    return Region(tuple(o.grid for o in change.objects if o.kind != "added"))

@@ -1,0 +1,106 @@
+"""Eqs. 4 and 5: who answers for a point, and the laws of an updated field."""
+
+from __future__ import annotations
+
+import torch
+
+from refield.field.render import render_many
+from refield.scene.change import ObjectChange, SceneChange
+from refield.update.composite import UpdatedField
+from refield.update.region import carved, move_out
+from tests.update.worlds import Ball, BallWorld, at, change_of, grid_of, moved, views
+
+
+def agreement(a: torch.Tensor, b: torch.Tensor) -> float:
+    """PSNR over rays, dB."""
+    return float(-10 * (a - b).square().mean().clamp_min(1e-12).log10())
+
+
+def rgb(field: object) -> torch.Tensor:
+    return render_many(field, views()).rgb  # type: ignore[arg-type]
+
+
+OLD = Ball(at(-0.5, 0.2, 0.25), 0.25)
+NEW_POSE = at(0.4, -0.3, 0.25, yaw=1.0)
+NEW = Ball(NEW_POSE, 0.25)
+BESIDE = Ball(at(0.3, 0.6, 0.3), 0.3)
+
+
+def test_nothing_changed_changes_nothing() -> None:
+    world = BallWorld((OLD, BESIDE))
+    updated = UpdatedField(world, SceneChange())
+    assert torch.equal(rgb(updated), rgb(world))
+
+
+def test_commuting_square_for_a_moved_object() -> None:
+    """render(world after) = render(update(world before)): the floor hides no part of what the helper must know."""
+    before, after = BallWorld((OLD, BESIDE)), BallWorld((NEW, BESIDE))
+    updated = UpdatedField(before, change_of(moved(OLD, NEW_POSE)), helper=after)
+    assert agreement(rgb(before), rgb(after)) < 24  # the move shows
+    assert agreement(rgb(updated), rgb(after)) > 34
+    # the sampler's cells were recomputed: nothing is missing at the new place, nothing is left at the old
+    assert updated.sampler.occupied(torch.tensor([[0.4, -0.3, 0.25]])).all()
+    assert not updated.sampler.occupied(torch.tensor([[-0.5, 0.2, 0.25]])).any()
+
+
+def test_commuting_square_for_two_moved_objects_that_swap() -> None:
+    a, b = OLD, Ball(at(0.4, -0.3, 0.25), 0.25)
+    to_b, to_a = at(0.4, -0.3, 0.25, 0.5), at(-0.5, 0.2, 0.25, -0.4)
+    before, after = BallWorld((a, b)), BallWorld((Ball(to_b, 0.25), Ball(to_a, 0.25)))
+    updated = UpdatedField(before, change_of(moved(a, to_b), moved(b, to_a)), helper=after)
+    assert agreement(rgb(updated), rgb(after)) > 34
+
+
+def test_commuting_square_for_removed_and_added() -> None:
+    before, after = BallWorld((OLD,)), BallWorld((BESIDE,))
+    change = change_of(ObjectChange("removed", grid_of(OLD)), ObjectChange("added", grid_of(BESIDE)))
+    updated = UpdatedField(before, change, helper=after)
+    assert agreement(rgb(updated), rgb(after)) > 40
+
+
+def test_without_a_helper_the_old_object_is_cut_out() -> None:
+    before = BallWorld((OLD, BESIDE), floor=False)
+    updated = UpdatedField(before, change_of(ObjectChange("removed", grid_of(OLD))))
+    x = OLD.world_from_ball[:3, 3].float() + 0.3 * torch.randn(2000, 3, generator=torch.Generator().manual_seed(0))
+    inside = updated.region.contains(x)
+    assert inside.any()
+    assert (updated.density(x)[inside] == 0).all()
+    torch.testing.assert_close(updated.density(x)[~inside], before.density(x)[~inside])
+    assert agreement(rgb(updated), rgb(BallWorld((BESIDE,), floor=False))) > 30
+
+
+def test_an_added_object_is_not_cut() -> None:
+    change = change_of(ObjectChange("added", grid_of(BESIDE)))
+    assert carved(change).grids == ()
+    world = BallWorld((OLD,))
+    assert torch.equal(rgb(UpdatedField(world, change)), rgb(world))
+
+
+def test_there_and_back_again() -> None:
+    """Update by T, then by T⁻¹: the first pictures."""
+    first = BallWorld((OLD, BESIDE))
+    there = change_of(moved(OLD, NEW_POSE))
+    back = change_of(moved(NEW, OLD.world_from_ball))
+    empty = BallWorld((BESIDE,))  # what both places look like without the object
+    second = UpdatedField(first, there, helper=empty)
+    third = UpdatedField(second, back, helper=empty)
+    assert agreement(rgb(second), rgb(first)) < 24
+    assert agreement(rgb(third), rgb(first)) > 32
+
+
+def test_move_in_wins_where_it_overlaps_the_region() -> None:
+    near = at(-0.3, 0.2, 0.25, 0.3)
+    before, after = BallWorld((OLD,)), BallWorld((Ball(near, 0.25),))
+    empty = BallWorld(())
+    updated = UpdatedField(before, change_of(moved(OLD, near)), helper=empty)
+    assert move_out(updated.change, 2.0).contains(torch.tensor([[-0.3, 0.2, 0.25]])).all()
+    assert agreement(rgb(updated), rgb(after)) > 32
+
+
+def test_gradients_reach_the_positions() -> None:
+    """A second estimate refines a pose through an updated field."""
+    updated = UpdatedField(BallWorld((OLD,)), change_of(moved(OLD, NEW_POSE)), helper=BallWorld(()))
+    x = (NEW.world_from_ball[:3, 3].float() + 0.05 * torch.randn(50, 3)).requires_grad_()
+    _, colour = updated(x, torch.nn.functional.normalize(torch.randn(50, 3), dim=-1))
+    (slope,) = torch.autograd.grad(colour.sum(), x)
+    assert slope.abs().sum() > 0
