@@ -10,10 +10,11 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from refield.scene.change import ObjectChange, SceneChange
-from refield.scene.pose import rotation_log
+from refield.scene.pose import rotation_log, skew, transform
 
 _VERSIONS_OF = ("refield", "torch", "numpy", "numba", "opencv-python-headless", "pycolmap")
 
@@ -81,9 +82,13 @@ def object_shift(change: ObjectChange) -> list[float] | None:
     """
     if change.new_from_old is None:
         return None
-    centre = change.grid.tight_aabb().mean(0).double()
-    t = change.new_from_old.double()
-    return (t[:3, :3] @ centre + t[:3, 3] - centre).tolist()
+    centre = _centre(change)
+    return (transform(change.new_from_old.double(), centre) - centre).tolist()
+
+
+def _centre(change: ObjectChange) -> Tensor:
+    """Of the grid's occupied part, (3,) float64, world."""
+    return change.grid.tight_aabb().mean(0).double()
 
 
 def uncertainty(change: ObjectChange) -> tuple[float, float] | None:
@@ -94,12 +99,8 @@ def uncertainty(change: ObjectChange) -> tuple[float, float] | None:
     if change.covariance is None or change.new_from_old is None:
         return None
     cov = change.covariance.double()
-    now = change.new_from_old.double()
-    centre = now[:3, :3] @ change.grid.tight_aabb().mean(0).double() + now[:3, 3]
-    lever = cov.new_zeros(3, 6)  # d centre / d twist = [I, -skew(centre)] for a left-multiplied twist
-    lever[:, :3] = cov.new_tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    x, y, z = centre.tolist()
-    lever[:, 3:] = cov.new_tensor([[0, z, -y], [-z, 0, x], [y, -x, 0]])
+    centre = transform(change.new_from_old.double(), _centre(change))
+    lever = torch.cat([torch.eye(3, dtype=cov.dtype), -skew(centre)], 1)  # d centre / d twist
     spread = float((lever @ cov @ lever.T).trace().clamp_min(0).sqrt())
     return spread, math.degrees(float(cov[3:, 3:].trace().clamp_min(0).sqrt()))
 
@@ -110,7 +111,7 @@ def summary(change: SceneChange) -> str:
     rejected = len(change.photos) - used
     photos = f"{used} new photo{'' if used == 1 else 's'}" + (f" ({rejected} rejected)" if rejected else "")
     if not change.objects:
-        return f"Nothing changed, by {photos}."
+        return f"Nothing changed; seen in {photos}."
     kinds = Counter(o.kind for o in change.objects)
     parts = ", ".join(f"{kinds[k]} {k}" for k in ("moved", "removed", "added") if kinds[k])
     n = len(change.objects)

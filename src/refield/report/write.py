@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from refield.report.visit import VisitReport
+from refield.report.page import html_page
+from refield.report.visit import VisitReport, visit_report_dict
+from refield.scene.files import write_bytes, write_json
 
 
 def write_report(folder: Path | str, report: VisitReport) -> Path:
-    """Write ``report.json`` and the self-contained ``report.html`` into an existing folder.
+    """Write ``report.json`` and the self-contained ``report.html`` into a folder, made if it is missing.
 
     Returns the page's path. Raises OSError if the folder cannot be written.
     """
-    raise NotImplementedError
+    folder = Path(folder)
+    write_json(folder / "report.json", visit_report_dict(report))
+    page = folder / "report.html"
+    write_bytes(page, html_page(report).encode())
+    return page

@@ -20,7 +20,7 @@ def align(image: Image, target: Image) -> Image:
     Where no small warp does better than none, the image comes back as it was. Edges are repeated.
     """
     h, w = target.shape[:2]
-    source, goal = (cv2.cvtColor(p.astype(np.float32), cv2.COLOR_RGB2GRAY) for p in (image, target))
+    source, goal = _grey(image), _grey(target)
     best, score = None, float(cv2.computeECC(goal, source))
     start = np.eye(3, dtype=np.float32)
     for motion in (cv2.MOTION_TRANSLATION, cv2.MOTION_HOMOGRAPHY):
@@ -51,3 +51,7 @@ def _corner_shift(warp: Warp, w: int, h: int) -> float:
     corners = np.array([[0, 0], [w, 0], [0, h], [w, h]], np.float32)
     moved = cv2.perspectiveTransform(corners[None], warp)[0]
     return float(np.linalg.norm(moved - corners, axis=1).max())
+
+
+def _grey(image: Image) -> Image:
+    return cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY).astype(np.float32, copy=False)

@@ -1,0 +1,245 @@
+"""The report page: self-contained, escaped, true to what it is given."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from refield.report import (
+    Comparison,
+    VisitReport,
+    summary,
+    visit_report_dict,
+    write_contact_sheet,
+    write_report,
+)
+from refield.report.pictures import IN_COLOUR, OUT_COLOUR, data_uri, with_masks
+from refield.report.visit import object_shift, turn, uncertainty
+from refield.scene import pose
+from refield.scene.camera import Camera
+from refield.scene.capture import Frame
+from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
+
+EVIL = "<script>alert('&\"x')</script>"
+MOVE = pose.exp(torch.tensor([0.3, 0.0, 0.1, 0.0, 0.0, math.radians(30)], dtype=torch.float64))
+
+
+def grid(centre: float = 0.0) -> OccupancyGrid:
+    box = torch.tensor([[-1.0, -1, -1], [1, 1, 1]]) + centre
+    return OccupancyGrid(box, torch.ones(5, 5, 5))
+
+
+def moved(**more: object) -> ObjectChange:
+    return replace(ObjectChange("moved", grid(2.0), MOVE, confidence=0.9), **more)  # type: ignore[arg-type]
+
+
+def photo(name: str, used: bool = True) -> PlacedPhoto:
+    if not used:
+        return PlacedPhoto(name, "rejected", "only 7 inliers")
+    frame = Frame(Path(name), Camera(30, 20, 30, 30, 15, 10), name, torch.eye(4, dtype=torch.float64))
+    return PlacedPhoto(name, "used", frame=frame)
+
+
+def picture(seed: int) -> torch.Tensor:
+    return torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def view(name: str, **more: object) -> Comparison:
+    return replace(Comparison(name, picture(0), picture(1), picture(2)), **more)  # type: ignore[arg-type]
+
+
+def full_report() -> VisitReport:
+    mask = torch.zeros(20, 30, dtype=torch.bool)
+    mask[4:9, 4:9] = True
+    objects = (moved(note=EVIL), ObjectChange("removed", grid()), ObjectChange("added", grid()))
+    change = SceneChange(objects, (photo("a.png"), photo(EVIL, used=False)), why=f"because {EVIL}")
+    scores = {"psnr": 30.0, "psnr_in": 27.123, "psnr_out": None, "ssim_in": 0.912}
+    old = {"psnr": 25.0, "psnr_in": 12.5, "psnr_out": None, "ssim_in": 0.5}
+    told = {"pooled": scores, "mean": scores, "pooled_before": old, "mean_before": old}
+    told["views"] = [{"name": EVIL, "scores": scores, "before": old}]
+    return VisitReport(
+        title=EVIL,
+        change=change,
+        photos=(view("a.png", mask_in=mask, mask_out=~mask), Comparison(EVIL, None)),
+        seconds={"detect": 1.25, EVIL: 3.5},
+        evaluation=told,
+        evaluation_views=(view(EVIL),),
+        facts={"held-out PSNR": 31.234, EVIL: EVIL},
+        warnings=(EVIL,),
+    )
+
+
+class Reader(HTMLParser):
+    """Collects what a browser would see, and checks that tags nest."""
+
+    VOID = ("meta", "img", "input", "link", "br", "hr")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-1:]}"
+        self.open.pop()
+
+    def handle_data(self, data: str) -> None:
+        if not self.open or self.open[-1] not in ("script", "style"):
+            self.text.append(data)
+
+
+def read(report: VisitReport, folder: Path) -> tuple[str, Reader]:
+    source = write_report(folder, report).read_text(encoding="utf-8")
+    reader = Reader()
+    reader.feed(source)
+    assert not reader.open
+    return source, reader
+
+
+def test_the_page_holds_everything_it_is_given(tmp_path: Path) -> None:
+    _, reader = read(full_report(), tmp_path / "visit")
+    text = " ".join(" ".join(reader.text).split())
+    for told in (
+        "3 objects changed: 1 moved, 1 removed, 1 added; seen in 1 new photo (1 rejected).", "because",
+        "only 7 inliers", "30.00°", "27.12", "12.50", "0.912", "31.23", "1.2", "detect", "torch",
+    ):  # fmt: skip
+        assert told in text, told
+    pictures = [a["src"] for t, a in reader.tags if t == "img"]
+    assert len(pictures) == 2 + 4 + 3  # the slider, the new photo with its masks, the evaluation view
+
+
+def test_nothing_is_fetched_and_nothing_runs_but_our_line(tmp_path: Path) -> None:
+    source, reader = read(full_report(), tmp_path)
+    assert sum(tag == "script" for tag, _ in reader.tags) == 1
+    for tag, attributes in reader.tags:
+        for key, value in attributes.items():
+            assert not key.startswith("on"), (tag, key)
+            if key in ("src", "href", "data", "action"):
+                assert value is not None and value.startswith("data:image/"), (tag, value)
+    assert not re.search(r"(https?:)?//\w|@import|url\(", re.sub(r"base64,[\w+/=]+", "", source))
+    assert "default-src 'none'" in source
+
+
+def test_text_from_outside_is_shown_not_obeyed(tmp_path: Path) -> None:
+    source, reader = read(full_report(), tmp_path)
+    assert "alert" in source and "<script>alert" not in source
+    assert any(EVIL in piece for piece in reader.text)
+
+
+def test_the_pictures_are_the_pictures(tmp_path: Path) -> None:
+    _, reader = read(full_report(), tmp_path)
+    sources = {a["alt"]: a["src"] or "" for t, a in reader.tags if t == "img"}
+    decoded = Image.open(io.BytesIO(base64.b64decode(sources["a.png: new photo"].split(",")[1])))
+    assert (np.asarray(decoded) == (picture(0) * 255).round().to(torch.uint8).numpy()).all()
+
+
+def test_large_pictures_are_scaled_and_compressed() -> None:
+    uri = data_uri(torch.rand(900, 1600, 3))
+    decoded = Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1])))
+    assert uri.startswith("data:image/jpeg") and decoded.size == (960, 540)
+
+
+def test_masks_are_drawn_in_their_colours() -> None:
+    mask_in, mask_out = torch.zeros(2, 20, 30, dtype=torch.bool)
+    mask_in[2:8, 2:8] = True
+    mask_out[10:16, 20:26] = True
+    out = (with_masks(picture(0), mask_in, mask_out) * 255).round()
+    assert out[2, 2].tolist() == list(IN_COLOUR) and out[10, 20].tolist() == list(OUT_COLOUR)
+    assert (out[5, 5] - (picture(0)[5, 5] * 255 + torch.tensor(IN_COLOUR)) / 2).abs().max() <= 1
+    plain = out[18, 28]
+    assert plain.max() == plain.min()  # grey elsewhere
+
+
+def test_no_change_is_a_report_too(tmp_path: Path) -> None:
+    change = SceneChange(photos=(photo("a.png"), photo("b.png")), why="The renders explain the photos.")
+    source, reader = read(VisitReport("w, visit 1", change, photos=(view("a.png", after=None),)), tmp_path)
+    text = "".join(reader.text)
+    assert "Nothing changed" in text and "The renders explain the photos." in text
+    assert "updated" not in text and '<div class="slide">' not in source
+    told = json.loads((tmp_path / "report.json").read_text())
+    assert told["objects"] == [] and told["evaluation"] is None
+
+
+def test_report_json_tells_the_same(tmp_path: Path) -> None:
+    report = replace(full_report(), facts={"psnr": math.nan})
+    write_report(tmp_path, report)
+    told = json.loads((tmp_path / "report.json").read_text())
+    assert told == json.loads(json.dumps(visit_report_dict(report), allow_nan=False))
+    assert told["facts"] == {"psnr": None}
+    assert [o["kind"] for o in told["objects"]] == ["moved", "removed", "added"]
+    assert told["objects"][0]["angle_deg"] == pytest.approx(30)
+    assert told["objects"][1]["new_from_old"] is None
+    assert told["photos"][1] == {"file": EVIL, "status": "rejected", "why": "only 7 inliers"}
+
+
+@pytest.mark.parametrize(
+    ("kinds", "used", "rejected", "sentence"),
+    [
+        ([], 1, 0, "Nothing changed; seen in 1 new photo."),
+        (["moved"], 4, 0, "1 object changed: 1 moved; seen in 4 new photos."),
+        (["added", "moved"], 2, 1, "2 objects changed: 1 moved, 1 added; seen in 2 new photos (1 rejected)."),
+    ],
+)  # fmt: skip
+def test_summary(kinds: list[str], used: int, rejected: int, sentence: str) -> None:
+    objects = tuple(moved() if k == "moved" else ObjectChange(k, grid()) for k in kinds)  # type: ignore[arg-type]
+    photos = [photo(f"{i}") for i in range(used)] + [photo(f"r{i}", used=False) for i in range(rejected)]
+    assert summary(SceneChange(objects, tuple(photos))) == sentence
+
+
+def test_a_turn_has_its_angle_and_axis() -> None:
+    angle, axis = turn(MOVE)
+    assert angle == pytest.approx(30) and axis == pytest.approx([0, 0, 1])
+    assert turn(torch.eye(4)) == (0.0, [0.0, 0.0, 0.0])
+
+
+def test_an_objects_shift_does_not_depend_on_the_worlds_origin() -> None:
+    far = torch.eye(4, dtype=torch.float64)
+    far[:3, 3] = torch.tensor([100.0, -50.0, 7.0])
+    there = ObjectChange("moved", grid(2.0), MOVE)
+    box = there.grid.aabb + torch.tensor([100.0, -50.0, 7.0])
+    elsewhere = ObjectChange("moved", OccupancyGrid(box, there.grid.values), far @ MOVE @ pose.invert(far))
+    assert object_shift(there) == pytest.approx(object_shift(elsewhere), abs=1e-4)
+
+
+def test_uncertainty_is_that_of_sampled_poses() -> None:
+    g = torch.Generator().manual_seed(0)
+    root = torch.randn(6, 6, generator=g, dtype=torch.float64) * 1e-3
+    change = moved(covariance=root @ root.T)
+    told = uncertainty(change)
+    twists = torch.randn(20000, 6, generator=g, dtype=torch.float64) @ root.T
+    centre = torch.tensor([2.0, 2, 2], dtype=torch.float64)
+    now = pose.transform(MOVE, centre)
+    places = (pose.exp(twists) @ torch.cat([now, torch.ones(1)]))[:, :3]
+    assert told is not None
+    assert told[0] == pytest.approx(float((places - now).square().sum(-1).mean().sqrt()), rel=0.03)
+    angles = twists[:, 3:].square().sum(-1).mean().sqrt()
+    assert told[1] == pytest.approx(math.degrees(float(angles)), rel=0.03)
+    assert uncertainty(moved()) is None
+
+
+def test_the_contact_sheet_shows_whole_rows_only(tmp_path: Path) -> None:
+    whole = Comparison("a", torch.zeros(20, 30, 3), torch.ones(20, 30, 3), torch.full((20, 30, 3), 0.5))
+    path = write_contact_sheet(tmp_path / "sheet.png", [whole, view("b", after=None)], height=40)
+    sheet = np.asarray(Image.open(path))
+    assert sheet.shape == (22 + 48 + 8, 3 * 60 + 32, 3)
+    row = sheet[22 + 24]
+    assert [row[8 + 30 + k * 68].tolist()[0] for k in range(3)] == [255, 0, 128]
+    with pytest.raises(ValueError, match="no view"):
+        write_contact_sheet(tmp_path / "none.png", [view("b", before=None)])
