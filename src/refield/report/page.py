@@ -70,8 +70,9 @@ def _slider(report: VisitReport) -> str:
     """The first view of which both fields' renders are known, to slide over."""
     for view in (*report.evaluation_views, *report.photos):
         if view.before is not None and view.after is not None:
+            aspect = view.before.shape[1] / view.before.shape[0]
             return (
-                '<h2>Before and after</h2><div class="slide">'
+                f'<h2>Before and after</h2><div class="slide" style="--aspect:{aspect:.4f}">'
                 f'<img alt="before the update" src="{data_uri(view.before)}">'
                 f'<img alt="after the update" src="{data_uri(view.after)}">'
                 '<span class="l">before</span><span class="r">after</span>'

@@ -20,7 +20,7 @@ IN_COLOUR, OUT_COLOUR = (
     (249, 115, 22),
 )  # told apart by colour-blind eyes too, unlike green and red
 WIDEST = 960  # pixels of a picture on the page
-_PNG_PIXELS = 400 * 400  # larger pictures are inlined as JPEG
+_PNG_PIXELS = 256 * 256  # larger pictures are inlined as JPEG
 _GAP, _CAPTION = 8, 22
 
 

@@ -28,7 +28,7 @@ def chips(report: VisitReport) -> str:
     """The numbers at the head of the page."""
     facts = dict(report.facts)
     if report.seconds:
-        facts["seconds in all"] = sum(report.seconds.values())
+        facts["seconds in all"] = f"{sum(report.seconds.values()):.1f}"
     items = "".join(f"<li>{escape(name)} <b>{escape(_told(value))}</b></li>" for name, value in facts.items())
     return f'<ul class="chips">{items}</ul>' if items else ""
 
