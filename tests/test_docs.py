@@ -1,0 +1,132 @@
+"""What the documents say is so: every function named exists, every equation has its place, commands are real."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import os
+import re
+import tomllib
+from functools import cache
+from pathlib import Path
+
+import pytest
+import refield
+from refield.cli import COMMANDS
+
+ROOT = Path(__file__).parent.parent
+SOURCE = ROOT / "src" / "refield"
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+REFERENCE = re.compile(r"`([\w/]+\.py):([\w.]+)`")
+
+
+@cache
+def names_in(path: Path) -> frozenset[str]:
+    """Functions, classes, methods and module-level names of a file: ``f``, ``C``, ``C.m``."""
+    found: set[str] = set()
+
+    def visit(body: list[ast.stmt], prefix: str) -> None:
+        for node in body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                found.add(prefix + node.name)
+            if isinstance(node, ast.ClassDef):
+                visit(node.body, f"{prefix}{node.name}.")
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+            found.update(prefix + t.id for t in targets if isinstance(t, ast.Name))
+
+    visit(ast.parse(path.read_text(encoding="utf-8")).body, "")
+    return frozenset(found)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_every_function_named_exists(page: Path) -> None:
+    for file, name in REFERENCE.findall(page.read_text(encoding="utf-8")):
+        assert (SOURCE / file).is_file(), f"{page.name}: there is no {file}"
+        assert name in names_in(SOURCE / file), f"{page.name}: {file} has no {name}"
+
+
+def test_every_equation_of_the_paper_has_its_place() -> None:
+    rows = [
+        line for line in (ROOT / "docs/method.md").read_text(encoding="utf-8").splitlines() if line[:1] == "|"
+    ]
+    places: dict[int, bool] = {}
+    for row in rows:
+        numbers = re.match(r"\| (\d+)(?:–(\d+))? \|", row)
+        if numbers:
+            first, last = int(numbers[1]), int(numbers[2] or numbers[1])
+            for n in range(first, last + 1):
+                places[n] = bool(REFERENCE.search(row))
+    assert sorted(places) == list(range(1, 17))
+    assert all(places.values()), [n for n, there in places.items() if not there]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_links_between_documents_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
+        if "://" not in target:
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_commands_are_real(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    shown = re.findall(r"^(?:.*/bin/)?refield (\w+)", text, re.MULTILINE) + re.findall(
+        r"`refield (\w+)", text
+    )
+    assert set(shown) <= set(COMMANDS)
+
+
+def commands() -> list[str]:
+    """The README's lines of shell."""
+    blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    return [line for block in blocks for line in block.splitlines()]
+
+
+def test_continuous_integration_runs_the_readmes_test_command() -> None:
+    (tests,) = [c for c in commands() if c.endswith("pytest")]
+    script = ROOT / ".ci" / "run"
+    assert tests in script.read_text(encoding="utf-8").splitlines()
+    assert os.access(script, os.X_OK)
+
+
+def test_demo_and_tests_are_one_line_each() -> None:
+    assert sum(c.startswith("python3 -m venv") and "&&" in c for c in commands()) == 2
+
+
+def snippets() -> list[tuple[str, str]]:
+    """Python that is meant to be run: the README's, and the examples."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    files = [(p.name, p.read_text(encoding="utf-8")) for p in sorted((ROOT / "examples").glob("*.py"))]
+    return [("README.md", b) for b in blocks] + files
+
+
+@pytest.mark.parametrize(("name", "source"), snippets(), ids=[n for n, _ in snippets()])
+def test_what_snippets_import_exists(name: str, source: str) -> None:
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("refield"):
+            module = importlib.import_module(node.module)
+            missing = [a.name for a in node.names if not hasattr(module, a.name)]
+            assert not missing, f"{name}: {node.module} has no {missing}"
+        if (
+            isinstance(node, ast.Attribute)
+            and isinstance(node.value, ast.Name)
+            and node.value.id == "refield"
+        ):
+            assert hasattr(refield, node.attr), f"{name}: refield has no {node.attr}"
+
+
+def test_the_table_of_contents_is_complete() -> None:
+    for name in refield.__all__:
+        assert getattr(refield, name).__module__.startswith("refield."), name
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        refield.nothing  # noqa: B018
+
+
+def test_every_dependency_is_explained() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needed = [*project["dependencies"], *(d for e in project["optional-dependencies"].values() for d in e)]
+    told = re.findall(r"^\|.*$", (ROOT / "docs/dependencies.md").read_text(encoding="utf-8"), re.MULTILINE)
+    for requirement in needed:
+        package = re.split(r"[^\w-]", requirement)[0]
+        assert any(re.search(rf"\| {re.escape(package)} \|", row) for row in told), package
