@@ -1,4 +1,4 @@
-"""What the documents say is so: every function named exists, every equation has its place, commands are real."""
+"""What the documents say is so: every function named exists, every equation has its place."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+
 import refield
 from refield.cli import COMMANDS
 

@@ -6,8 +6,8 @@
     change = refield.estimate_change(capture, field, photos)
     updated = refield.update_field(capture, field, change)
 
-This is the table of contents; a name is imported when it is first used. Metrics are in `refield.evaluate`, the
-report page in `refield.report`.
+This is the table of contents; a name is imported when it is first used. Metrics are in `refield.evaluate`,
+the report page in `refield.report`.
 """
 
 from __future__ import annotations

@@ -1,0 +1,48 @@
+"""An updated field is a field: update it again. Here the object goes back to where it was.
+
+Run: python examples/04_update_twice.py [OUT]
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+
+import refield
+from refield.history import retouched
+from refield.scene.pose import angle_between
+from refield.synthetic import sample_folder
+
+
+def main(out: Path) -> None:
+    sample = sample_folder()
+    capture = refield.load_capture(sample / "before")
+    field = refield.fit_field(capture)
+
+    there = refield.load_new_photos(sample / "after", capture)
+    first = refield.estimate_change(capture, field, there)
+    moved = refield.update_field(capture, field, first)
+
+    back = capture.held_out[:4]  # photos of the first state, which the field has not been trained on
+    with tempfile.TemporaryDirectory() as scratch:
+        # the old photos show the first state; where that differs, the updated field's picture takes their place
+        now = retouched(capture, field, moved, Path(scratch))
+        second = refield.estimate_change(now, moved, back)
+        returned = refield.update_field(now, moved, second)
+
+    for there_and_back in zip(first.objects, second.objects):
+        a, b = (o.new_from_old for o in there_and_back)
+        if a is not None and b is not None:
+            turn = float(angle_between(b @ a, torch.eye(4, dtype=torch.float64)))
+            print(f"there and back: {turn:.2f} degrees left over")
+    view = capture.held_out[-1]
+    for name, state in (("0_before", field), ("1_moved", moved), ("2_returned", returned)):
+        refield.write_image(out / f"{name}.png", refield.render_frame(state, view).rgb)
+    print(f"pictures in {out}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "update-twice"))
