@@ -28,7 +28,7 @@ def main(out: Path) -> None:
 
     back = capture.held_out[:4]  # photos of the first state, which the field has not been trained on
     with tempfile.TemporaryDirectory() as scratch:
-        # the old photos show the first state; where that differs, the updated field's picture takes their place
+        # the old photos show the first state; where that differs, the updated field's picture stands in
         now = retouched(capture, field, moved, Path(scratch))
         second = refield.estimate_change(now, moved, back)
         returned = refield.update_field(now, moved, second)
