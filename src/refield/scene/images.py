@@ -23,7 +23,7 @@ from refield.scene.files import write_bytes
 MAX_PIXELS = 64_000_000
 """A 48-megapixel phone photo passes; what is larger is more likely a bomb or a mistake."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
-_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "PPM")  # nothing that starts another program (EPS)
+_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")  # nothing that starts another program (EPS)
 _DIRECT = ("L", "RGB", "1")
 _WITH_ALPHA = ("RGBA", "LA", "PA", "P")  # a palette may carry transparency
 _MARK = ("Software", "refield")  # in every PNG we write, so that we replace no other
