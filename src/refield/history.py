@@ -43,7 +43,7 @@ def state(workspace: Workspace, visit: int) -> Field:
 
 
 def retouched(capture: Capture, before: Field, now: Field, folder: Path) -> Capture:
-    """The capture as if taken ``now``: where the photos show what has changed since, the field's picture stands.
+    """The capture as if taken ``now``: where the photos show what has changed since, the field's own stand.
 
     The photos are from ``before``; an update must not learn from them what an earlier visit has put right.
     Written as PNGs into ``folder``.

@@ -181,6 +181,7 @@ REFUSED = {
     "mirrored": (spoil(lambda c, f: matrix(c, mirrored(f["transform_matrix"]))), "mirrored"),
     "last row": (spoil(lambda c, f: f["transform_matrix"][3].__setitem__(0, 1.0)), "last row"),
     "no focal": (spoil(lambda c, f: (c.pop("fl_x"), c.pop("fl_y"))), "fl_x.*no focal length"),
+    "no fl_x": (spoil(lambda c, f: c.pop("fl_x")), "fl_x.*no focal length"),
     "negative focal": (spoil(lambda c, f: f.update(fl_x=-5)), "004.*fl_x"),
     "focal is text": (spoil(lambda c, f: f.update(fl_x="40")), "004.*fl_x.*not a number"),
     "focal is true": (spoil(lambda c, f: f.update(fl_x=True)), "004.*fl_x.*not a number"),

@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from refield.field.fit import FitProgress
 
@@ -53,6 +54,22 @@ class Clock:
         self._since = now
 
     @contextlib.contextmanager
+    def counting(self, what: str) -> Iterator[Callable[[int, int], None]]:
+        """A bar for a known number of things; call it with how many are done and how many there are."""
+        progress = Progress(
+            TextColumn("         {task.description}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=self.console,
+            transient=True,
+            disable=not self.console.is_terminal,
+        )
+        with progress:
+            task = progress.add_task(what, total=None)
+            yield lambda done, total: progress.update(task, completed=done, total=total)
+
+    @contextlib.contextmanager
     def training(self, name: str) -> Iterator[TrainingLine]:
         """A progress line for a fit: a bar on a terminal, else a line every few seconds."""
         progress = Progress(
@@ -68,20 +85,42 @@ class Clock:
             yield TrainingLine(self.console, progress, task, name)
 
 
+class Look(Protocol):
+    """What both the fit and the update tell of a running training."""
+
+    @property
+    def step(self) -> int: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def psnr(self) -> float: ...
+    @property
+    def seconds(self) -> float: ...
+
+
 class TrainingLine:
-    """Shows each `FitProgress` it is called with, and remembers the last."""
+    """Shows each look at the training that it is called with, and remembers the last PSNR (dB)."""
 
     def __init__(self, console: Console, progress: Progress, task: TaskID, name: str) -> None:
         self._console, self._progress, self._task, self._name = console, progress, task, name
-        self._shown = 0.0
-        self.last: FitProgress | None = None
+        self._shown = time.perf_counter()
+        self.psnr = math.nan
 
-    def __call__(self, p: FitProgress) -> None:
-        self.last = p
-        psnr = "-" if math.isnan(p.psnr) else f"{p.psnr:.2f} dB"
-        facts = f"step {p.step}/{p.steps}  held-out {psnr}  {p.rays_per_second / 1e3:.0f}k rays/s"
-        facts += f"  {p.seconds_left:.0f} s left"
-        self._progress.update(self._task, completed=p.step / p.steps, facts=facts)
+    def __call__(self, look: Look) -> None:
+        self.psnr = look.psnr
+        self._progress.update(self._task, completed=look.step / look.steps, facts=_facts(look))
         if self._progress.disable and time.perf_counter() - self._shown > _QUIET_SECONDS:
             self._shown = time.perf_counter()
-            self._console.print(f"           {self._name}: {facts}", markup=False)
+            self._console.print(f"           {self._name}: {_facts(look)}", markup=False)
+
+
+def _facts(look: Look) -> str:
+    parts = [f"step {look.step}/{look.steps}"]
+    if not math.isnan(look.psnr):
+        parts.append(f"held-out {look.psnr:.2f} dB")
+    if isinstance(look, FitProgress):
+        parts.append(f"{look.rays_per_second / 1e3:.0f}k rays/s")
+        left = look.seconds_left
+    else:
+        left = look.seconds * (look.steps / max(look.step, 1) - 1)
+    return "  ".join([*parts, f"{left:.0f} s left"])

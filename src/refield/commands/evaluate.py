@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Annotated
 
 from rich.console import Console
 from rich.table import Table
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from refield.artefacts import writable
 from refield.commands.clock import Clock
@@ -21,9 +23,9 @@ from refield.workspace import Workspace
 class Evaluate:
     """Compare renderings with photos: PSNR and SSIM, inside the masks and on untouched pixels."""
 
-    work: Positional[Path]
+    work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace"""
-    eval: Positional[Path]
+    eval: Annotated[Path, arg(metavar="EVAL"), Positional]
     """a folder with transforms.json, images/, and masks_in/ and masks_out/ (PNGs with the images' names)"""
     visit: int | None = None
     """the state to measure: 0 is before any visit; the latest by default, beside the state before any"""
@@ -45,7 +47,7 @@ def run(options: Evaluate) -> None:
     if options.out is not None:
         with writable(options.out):
             write_json(options.out, report.to_dict())
-    Console().print(table(report, f"visit {visit}"))
+    Console(width=None if sys.stdout.isatty() else 120).print(table(report, f"visit {visit}"))
 
 
 def table(report: Report, name: str) -> Table:
@@ -57,7 +59,7 @@ def table(report: Report, name: str) -> Table:
         out.add_column(column.replace("_", "-"), justify="right")
     rows = [(v.name, v.scores, v.scores_before) for v in report.views]
     for label, scores, before in [*rows, ("all", report.pooled, report.pooled_before)]:
-        out.add_row(label, *(_cell(scores, before, column) for column in columns))
+        out.add_row(label.rpartition("/")[2], *(_cell(scores, before, column) for column in columns))
     return out
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from refield.artefacts import writable
 from refield.commands.clock import Clock
@@ -24,7 +25,7 @@ from refield.workspace import Workspace
 class Render:
     """Render the views of a transforms.json, one PNG per frame with the frame's file name."""
 
-    work: Positional[Path]
+    work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace"""
     cameras: Path
     """a transforms.json (its images need not exist), in the world of the workspace's photos"""

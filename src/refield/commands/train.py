@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
 from refield.field.fit import FitConfig, fit_field
@@ -20,9 +21,9 @@ from refield.workspace import Workspace
 class Train:
     """Fit a field to photos with known camera poses, and keep both in a new workspace."""
 
-    data: Positional[Path]
+    data: Annotated[Path, arg(metavar="DATA"), Positional]
     """a transforms.json or its folder, or a folder with a COLMAP model in sparse/0 and images/"""
-    work: Positional[Path]
+    work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace to make"""
     overwrite: bool = False
     """replace the workspace that is there, with its visits"""
@@ -53,10 +54,9 @@ def train(
         with clock.training("fit") as line:
             fitted = fit_field(capture, config, line)
         clock.stage("keep the field")
-        psnr = line.last.psnr if line.last else float("nan")
-        workspace.keep_field(fitted, psnr)
+        workspace.keep_field(fitted, line.psnr)
     clock.stop()
-    return psnr
+    return line.psnr
 
 
 def _check_memory(data: Path, capture: Capture) -> None:

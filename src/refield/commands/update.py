@@ -6,8 +6,9 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
 from refield.commands.page import page
@@ -33,9 +34,9 @@ MOST_LOST = 0.2
 class Update:
     """Find out from a few new photos what moved, left or arrived, and bring the field up to date."""
 
-    work: Positional[Path]
+    work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace"""
-    photos: Positional[Path]
+    photos: Annotated[Path, arg(metavar="PHOTOS"), Positional]
     """the new photos: a transforms.json or its folder, with poses in the world of the old ones"""
     evaluation: Path | None = None
     """a folder of further photos (transforms.json, images/, masks_in/, masks_out/) to measure by"""

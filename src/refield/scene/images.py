@@ -115,7 +115,7 @@ def write_image(path: Path, image: Tensor) -> None:
     mark = PngImagePlugin.PngInfo()
     mark.add_text(*_MARK)
     Image.fromarray(image.numpy()).save(buffer, format="PNG", pnginfo=mark)
-    write_bytes(path, buffer.getvalue())
+    write_bytes(path, buffer.getvalue(), durable=False)
 
 
 def is_ours(path: Path) -> bool:

@@ -108,7 +108,7 @@ def _focal(entry: Entry, where: str, width: int, height: int) -> tuple[float, fl
                     f"{where}: camera_angle_{axis}", f"{angle:g} is not in (0, pi)", "give radians"
                 )
             found[axis] = pixels / 2 / math.tan(angle / 2)
-    if not found:
+    if not found or ("x" not in found and "fl_y" in entry):
         raise InputError(
             f"{where}: fl_x", "no focal length is given", "add fl_x in pixels, or camera_angle_x"
         )

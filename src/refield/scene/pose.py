@@ -68,7 +68,7 @@ def exp(twist: Tensor) -> Tensor:
 
 
 def rotation_log(rotation: Tensor) -> Tensor:
-    """(..., 3, 3) -> rotation vector (..., 3), angle in [0, pi]; stable at both ends (through the quaternion)."""
+    """(..., 3, 3) -> rotation vector (..., 3), angle in [0, pi]; stable at both ends (by the quaternion)."""
     q = _quaternion(rotation)
     w, v = q[..., :1], q[..., 1:]
     n = v.norm(dim=-1, keepdim=True)
