@@ -1,0 +1,22 @@
+"""What several test files share: a workspace trained for a moment, once per run."""
+
+import pytest
+
+from refield.cli import main
+from tests.captures import write_capture
+
+TINY_FIT = ["--fit.steps", "3", "--fit.samples", "2048", "--fit.field.levels", "2"]
+TINY_FIT += ["--fit.field.log2-table", "8", "--fit.field.width", "8"]
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory):
+    """``data/`` (a capture), ``new/`` (four posed photos of the same scene) and ``work/`` (trained on it).
+
+    To be copied before anything is written.
+    """
+    folder = tmp_path_factory.mktemp("tiny")
+    write_capture(folder / "data", 12)
+    write_capture(folder / "new", 4, turn=0.2)
+    assert main(["train", str(folder / "data"), str(folder / "work"), *TINY_FIT]) == 0
+    return folder

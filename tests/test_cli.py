@@ -1,0 +1,216 @@
+"""The commands join the stages: what they write, print and return."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from refield.cli import COMMANDS, main
+from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
+from refield.scene.images import read_image
+from tests.conftest import TINY_FIT
+from tests.folders import contents
+
+update = pytest.importorskip("refield.commands.update")
+
+
+@pytest.fixture
+def place(tiny, tmp_path, monkeypatch):
+    for name in ("data", "new", "work"):
+        shutil.copytree(tiny / name, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_help_is_light_and_names_every_command():
+    code = "import sys; from refield.cli import main; main(['--help']); assert 'torch' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and all(name in done.stdout for name in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main([command, "--help"])
+    assert caught.value.code == 0
+    assert f"refield {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "argv", [[], ["train"], ["train", "a", "b", "--no-such-option"], ["render", "w", "--visit", "x"]]
+)
+def test_wrong_usage_is_exit_code_2(argv, capsys):
+    try:
+        code = main(argv)
+    except SystemExit as stop:
+        code = stop.code
+    assert code == 2
+
+
+def test_version(capsys):
+    import refield
+
+    assert main(["--version"]) == 0
+    assert refield.__version__ in capsys.readouterr().out
+
+
+def test_render_writes_one_picture_per_frame(place, capsys):
+    argv = ["render", "work", "--cameras", "new/transforms.json", "--out", "pictures"]
+    for _ in range(2):  # our own pictures may be replaced
+        assert main(argv) == 0
+    assert sorted(p.name for p in (place / "pictures").iterdir()) == [f"00{i}.png" for i in range(4)]
+    assert read_image(place / "pictures/000.png").shape == (24, 32, 3)
+    assert "4 pictures in pictures" in capsys.readouterr().out
+
+
+def test_evaluate_writes_numbers(place, capsys):
+    assert main(["evaluate", "work", "new", "--out", "numbers.json"]) == 0
+    assert json.loads((place / "numbers.json").read_text())["pooled"]["psnr"] > 0
+    assert "psnr" in capsys.readouterr().out
+
+
+def believing(monkeypatch, *kinds):
+    """Let the estimate say that an object of each kind changed in the middle of the scene."""
+
+    def estimate(capture, field, frames, config, on_stage=None):
+        for name in ("look", "decide"):
+            on_stage(name)
+        grid = OccupancyGrid(torch.tensor([[-0.3, -0.3, -0.3], [0.3, 0.3, 0.3]]), torch.ones(5, 5, 5))
+        shift = torch.eye(4, dtype=torch.float64)
+        shift[0, 3] = 0.5
+        empty = tuple(torch.zeros(24, 32, dtype=torch.bool) for _ in capture.train)
+        objects = tuple(
+            ObjectChange(k, grid, shift if k == "moved" else None, masks=empty, masks_in=empty) for k in kinds
+        )
+        seen = torch.zeros(24, 32, dtype=torch.bool)
+        seen[8:16, 10:20] = True
+        photos = tuple(PlacedPhoto(f.name, "used", "", f) for f in frames[:3])
+        photos += (PlacedPhoto(frames[3].name, "rejected", "blurred"),)
+        return SceneChange(objects, photos, "because", (seen,) * 3, (seen,) * 3)
+
+    monkeypatch.setattr(update, "estimate_change", estimate)
+
+
+FEW = ["--update.steps", "2", "--update.samples", "512"]
+
+
+def test_nothing_changed_writes_only_the_report(place, monkeypatch, capsys):
+    believing(monkeypatch)
+    before = contents(place / "work")
+    assert main(["update", "work", "new"]) == 0
+    out = capsys.readouterr()
+    assert out.out.startswith("nothing changed")
+    written = contents(place / "work")
+    assert {k: v for k, v in written.items() if not k.startswith("visits/")} == before
+    names = {k.removeprefix("visits/001/") for k in written.keys() - before.keys()}
+    assert names == {"change.json", "report.json", "report.html"}
+    record = json.loads((place / "work/visits/001/change.json").read_text())
+    assert record["objects"] == [] and [p["status"] for p in record["photos"]] == ["used"] * 3 + ["rejected"]
+    assert set(json.loads((place / "work/visits/001/report.json").read_text())["seconds"]) >= {
+        "look",
+        "decide",
+    }
+
+
+def test_updates_stack(place, monkeypatch, capsys):
+    monkeypatch.setattr(update, "MOST_LOST", 100.0)  # three steps of fitting know nothing
+    believing(monkeypatch, "removed")
+    assert main(["update", "work", "new", *FEW]) == 0
+    assert "1 object changed: 1 removed" in capsys.readouterr().out
+    believing(monkeypatch, "moved", "added")
+    assert main(["update", "work", "new", "--evaluation", "new", *FEW]) == 0
+    for n in ("001", "002"):
+        visit = place / "work/visits" / n
+        for name in (
+            "change.json",
+            "grid_0.npz",
+            "field.safetensors",
+            "report.json",
+            "report.html",
+            "photos/transforms.json",
+        ):
+            assert (visit / name).is_file(), name
+    shown = []
+    for n in (0, 1, 2):
+        assert (
+            main(["render", "work", "--cameras", "new/transforms.json", "--out", f"v{n}", "--visit", f"{n}"])
+            == 0
+        )
+        shown.append(torch.stack([read_image(place / f"v{n}/00{i}.png").float() for i in range(4)]))
+    assert main(["render", "work", "--cameras", "new/transforms.json", "--out", "latest"]) == 0
+    assert torch.equal(read_image(place / "latest/000.png"), read_image(place / "v2/000.png"))
+    assert (shown[0] - shown[1]).abs().max() > 2 and (shown[1] - shown[2]).abs().max() > 2
+    assert main(["evaluate", "work", "new", "--visit", "1"]) == 0
+
+
+def test_an_update_that_does_harm_is_not_kept(place, monkeypatch, capsys):
+    believing(monkeypatch, "removed")
+    monkeypatch.setattr(update, "untouched_psnr", lambda *a: [30.0, 28.0])
+    before = contents(place / "work")
+    assert main(["update", "work", "new", *FEW]) == 2
+    assert "2.0 dB worse and is not kept" in capsys.readouterr().err
+    assert contents(place / "work") == before
+
+
+def test_no_usable_photo(place, monkeypatch, capsys):
+    def estimate(capture, field, frames, config, on_stage=None):
+        return SceneChange(photos=tuple(PlacedPhoto(f.name, "rejected", "98 % changed") for f in frames))
+
+    monkeypatch.setattr(update, "estimate_change", estimate)
+    before = contents(place / "work")
+    assert main(["update", "work", "new"]) == 2
+    assert "98 % changed" in capsys.readouterr().err and contents(place / "work") == before
+
+
+def test_ctrl_c_leaves_no_workspace(place, monkeypatch, capsys):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("refield.commands.train.fit_field", interrupted)
+    assert main(["train", "data", "out", *TINY_FIT]) == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert not (place / "out").exists()
+
+
+def test_faults_of_ours_keep_their_traceback(place, monkeypatch):
+    def broken(*args):
+        raise RuntimeError("a fault")
+
+    monkeypatch.setattr("refield.commands.train.fit_field", broken)
+    with pytest.raises(RuntimeError, match="a fault"):
+        main(["train", "data", "out", *TINY_FIT])
+    assert not (place / "out").exists()
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_leave_no_half_workspace(place, number, code):
+    argv = [sys.executable, "-m", "refield", "train", "data", "out", "--fit.steps", "100000"]
+    process = subprocess.Popen(argv, cwd=place, stderr=subprocess.PIPE, text=True)
+    for _ in range(600):
+        if list(place.glob("out/.part-*/capture/transforms.json")):
+            break
+        time.sleep(0.1)
+    time.sleep(0.3)
+    process.send_signal(number)
+    assert process.wait(timeout=60) == code
+    assert not (place / "out").exists()
+
+
+def test_a_killed_training_is_no_workspace_and_can_be_repeated(place):
+    argv = [sys.executable, "-m", "refield", "train", "data", "out", "--fit.steps", "100000"]
+    process = subprocess.Popen(argv, cwd=place, stderr=subprocess.DEVNULL)
+    for _ in range(600):
+        if list(place.glob("out/.part-*/capture/transforms.json")):
+            break
+        time.sleep(0.1)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (place / "out/refield.json").exists()
+    assert main(["train", "data", "out", *TINY_FIT]) == 0
+    assert not list(place.glob("out/.part-*"))
