@@ -1,0 +1,147 @@
+"""A world → photos on disk: ``before/``, ``after/``, ``eval/`` and the true change in ``truth/``.
+
+``before``, ``after`` and ``eval`` are captures (transforms.json + images/). ``after`` and ``eval`` also have
+``masks_in/`` (where the object is now visible), ``masks_out/`` (where the old one would be) and ``depth/``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refield.scene.camera import Camera
+from refield.scene.capture import Capture, Frame
+from refield.scene.change import ObjectChange, PlacedPhoto, SceneChange
+from refield.scene.change_files import save_change
+from refield.scene.errors import InputError
+from refield.scene.images import write_image
+from refield.scene.transforms_json import save_transforms
+from refield.synthetic.cameras import hemisphere, ring, square_camera
+from refield.synthetic.pathtrace import PathTracer
+from refield.synthetic.visibility import silhouette, view_hits
+from refield.synthetic.worlds import WORLDS, State, TrueChange, World
+
+Progress = Callable[[int, int], None]
+"""Called with the pictures done and their number."""
+
+
+@dataclass(frozen=True)
+class SynthConfig:
+    """How a world is photographed."""
+
+    size: int = 128
+    """pixels a side"""
+    spp: int = 64
+    """light paths a pixel"""
+    cameras: int = 180
+    """of the old photos, on 10 heights (§11.1)"""
+    seed: int = 0
+    """of textures, surroundings and the paths"""
+
+    def __post_init__(self) -> None:
+        for name, least in (("size", 8), ("spp", 1), ("cameras", 10), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"--{name}", f"is {getattr(self, name)}", f"give at least {least}")
+
+
+def write_world(
+    name: str,
+    out: Path,
+    *,
+    size: int = 128,
+    spp: int = 64,
+    cameras: int = 180,
+    seed: int = 0,
+    on_progress: Progress | None = None,
+) -> World:
+    """Render the world called ``name`` into the folder ``out``.
+
+    Raises:
+        InputError: there is no such world, a number is out of range, or Mitsuba is not installed.
+    """
+    if name not in WORLDS:
+        raise InputError(f"world {name!r}", "there is no such world", f"choose one of {', '.join(WORLDS)}")
+    world = WORLDS[name](seed)
+    photograph(world, out, SynthConfig(size, spp, cameras, seed), on_progress)
+    return world
+
+
+def photograph(world: World, out: Path, config: SynthConfig, on_progress: Progress | None = None) -> None:
+    """Render a world's old photos, new photos (every other one for evaluation), masks and the truth."""
+    camera = square_camera(config.size)
+    old, new = hemisphere(config.cameras, world.target), ring(world.target)
+    total, done = len(old) + len(new), 0
+
+    def shoot(folder: str, state: State, poses: Sequence[Tensor]) -> Capture:
+        nonlocal done
+        tracer, frames = PathTracer(state), []
+        for i, pose in enumerate(poses):
+            path = out / folder / "images" / f"{i:04d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_image(path, tracer.photo(camera, pose, config.spp, config.seed * 100_003 + done))
+            frames.append(Frame(path, camera, f"images/{path.name}", pose))
+            done += 1
+            if on_progress is not None:
+                on_progress(done, total)
+        capture = Capture(tuple(frames))
+        save_transforms(out / folder / "transforms.json", capture)
+        return capture
+
+    before = shoot("before", world.before, old)
+    after = shoot("after", world.after, new[0::2])
+    evaluation = shoot("eval", world.after, new[1::2])
+    for folder, capture in (("after", after), ("eval", evaluation)):
+        _write_masks(world, out / folder, capture)
+    (out / "truth").mkdir(exist_ok=True)
+    save_change(out / "truth", true_change(world, before, after.frames))
+
+
+def true_change(world: World, before: Capture, frames: Sequence[Frame]) -> SceneChange:
+    """What `estimate` should find: masks as in ``before.train``, and the new photos all used."""
+    return SceneChange(
+        objects=tuple(_object_change(world, change, before.train) for change in world.changes),
+        photos=tuple(PlacedPhoto(frame.name, "used", frame=frame) for frame in frames),
+        why="known from the world's description",
+        masks_in=tuple(masks(world, f.camera, f.world_from_cam)[0] for f in frames),
+        masks_out=tuple(masks(world, f.camera, f.world_from_cam)[1] for f in frames),
+    )
+
+
+def masks(world: World, camera: Camera, world_from_cam: Tensor) -> tuple[Tensor, Tensor]:
+    """Move-in (what arrived, visible now) and move-out (what was there, visible then), (H, W) bool each."""
+    none = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    now = [silhouette(world.after, c.new.name, camera, world_from_cam) for c in world.changes if c.new]
+    then = [silhouette(world.before, c.old.name, camera, world_from_cam) for c in world.changes if c.old]
+    return reduce(torch.logical_or, now, none), reduce(torch.logical_or, then, none)
+
+
+def _object_change(world: World, change: TrueChange, frames: Sequence[Frame]) -> ObjectChange:
+    def seen(state: State, name: str) -> tuple[Tensor, ...]:
+        return tuple(silhouette(state, name, f.camera, f.world_from_cam) for f in frames)
+
+    item = change.old or change.new
+    assert item is not None  # a change has one side at least
+    return ObjectChange(
+        kind=change.kind,
+        grid=item.grid(),
+        new_from_old=change.new_from_old,
+        masks=seen(world.before, change.old.name) if change.old else (),
+        masks_in=seen(world.after, change.new.name) if change.new else (),
+    )
+
+
+def _write_masks(world: World, folder: Path, capture: Capture) -> None:
+    for kind in ("masks_in", "masks_out", "depth"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    for frame in capture.frames:
+        now, then = masks(world, frame.camera, frame.world_from_cam)
+        write_image(folder / "masks_in" / frame.path.name, now)
+        write_image(folder / "masks_out" / frame.path.name, then)
+        depth = view_hits(world.after, frame.camera, frame.world_from_cam).depth
+        np.savez_compressed(folder / "depth" / f"{frame.path.stem}.npz", depth=depth.numpy())

@@ -1,0 +1,108 @@
+"""The renderer and the closed forms see the same scene; a written world is complete."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from refield.scene.change_files import load_change
+from refield.scene.errors import InputError
+from refield.scene.images import read_image, read_mask
+from refield.scene.transforms_json import load_transforms
+from refield.synthetic import pathtrace
+from refield.synthetic.cameras import ring, square_camera
+from refield.synthetic.visibility import view_hits
+from refield.synthetic.worlds import WORLDS
+from refield.synthetic.write import SynthConfig, write_world
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+
+@pytest.fixture(scope="module")
+def tracer():
+    pytest.importorskip("mitsuba", reason="the renderer is an extra: pip install 'refield[synth]'")
+    return pathtrace.PathTracer
+
+
+def test_the_probe_names_a_variant_and_survives_a_broken_one(monkeypatch):
+    assert pathtrace.variant() in ("llvm_ad_rgb", "scalar_rgb")
+    for broken in ("import os; os.abort()", "print('none')", "print(15)"):
+        monkeypatch.setattr(pathtrace, "_PROBE", broken)
+        assert pathtrace.variant.__wrapped__() == "scalar_rgb"
+
+
+def test_a_missing_renderer_is_one_clear_line(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "mitsuba", None)
+    with pytest.raises(InputError, match=r"pip install 'refield\[synth\]'"):
+        pathtrace.mitsuba.__wrapped__()
+
+
+def test_the_picture_shows_each_item_where_the_closed_form_has_it(tracer):
+    """Items painted in one glowing colour each, in a dark world: the brightest channel names the item."""
+    from dataclasses import replace
+
+    world = WORLDS["removed"](0)
+    paints = np.array([[0.02, 0.02, 0.02], [0.9, 0.02, 0.02], [0.02, 0.02, 0.9]], np.float32)
+    items = tuple(
+        replace(i, texture=np.broadcast_to(p, i.texture.shape).copy(), glossy=False)
+        for i, p in zip(world.before.items, paints)
+    )
+    state = replace(world.before, items=items, surroundings=np.ones((8, 16, 3), np.float32))
+    camera, pose = square_camera(48), ring(world.target)[1]
+    image = tracer(state).photo(camera, pose, 32, 0)
+    assert image.shape == (48, 48, 3) and image.isfinite().all()
+    item = view_hits(state, camera, pose).item
+    for index, channel in ((1, 0), (2, 2)):
+        red = image[..., channel] > image[..., 2 - channel] + 0.2
+        assert ((red & (item == index)).sum() / (red | (item == index)).sum()) > 0.85
+
+
+def test_the_texture_is_laid_on_as_the_closed_form_says(tracer):
+    """Against the texture looked up by hand, under even light: brighter is brighter everywhere."""
+    from refield.field.render import render_camera
+    from refield.synthetic.oracles import AnalyticField
+
+    world = WORLDS["cube"](0)
+    camera, pose = square_camera(48), ring(world.target)[2]
+    photo = tracer(world.before).photo(camera, pose, 32, 0)
+    plain = render_camera(AnalyticField(world.before), camera, pose).rgb
+    hits = view_hits(world.before, camera, pose).item
+    for index in (0, 1):
+        shown = hits == index
+        for channel in range(3):
+            pair = torch.stack([photo[shown][:, channel], plain[shown][:, channel]])
+            assert torch.corrcoef(pair)[0, 1] > 0.8
+
+
+def test_a_written_world_is_complete_and_consistent(tracer, tmp_path):
+    seen = []
+    write_world(
+        "added",
+        tmp_path,
+        size=32,
+        spp=4,
+        cameras=10,
+        seed=1,
+        on_progress=lambda done, n: seen.append((done, n)),
+    )
+    assert seen == [(i + 1, 18) for i in range(18)]
+    before, after, evaluation = (load_transforms(tmp_path / part) for part in ("before", "after", "eval"))
+    assert (len(before.frames), len(after.frames), len(evaluation.frames)) == (10, 4, 4)
+    change = load_change(tmp_path / "truth", before, photos=after.frames)
+    assert [o.kind for o in change.objects] == ["added"] and len(change.frames) == 4
+    for frame in after.frames + evaluation.frames:
+        folder = frame.path.parent.parent
+        assert read_image(frame.path).shape == (32, 32, 3)
+        assert read_mask(folder / "masks_in" / frame.path.name).any()
+        assert not read_mask(folder / "masks_out" / frame.path.name).any()
+        assert np.load(folder / "depth" / f"{frame.path.stem}.npz")["depth"].shape == (32, 32)
+    assert json.loads((tmp_path / "truth" / "change.json").read_text())["objects"][0]["new_from_old"] is None
+
+
+def test_bad_requests_are_refused_before_any_work(tmp_path):
+    with pytest.raises(InputError, match="cube, cylinder"):
+        write_world("cubes", tmp_path / "x")
+    with pytest.raises(InputError, match="cameras"):
+        SynthConfig(cameras=9)
+    assert not (tmp_path / "x").exists()
