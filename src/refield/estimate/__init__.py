@@ -1,0 +1,1 @@
+"""What changed? §4.2 of the paper, one file per step, in order."""

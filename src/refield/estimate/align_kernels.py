@@ -1,0 +1,199 @@
+"""The hot loop of registration: coloured points against photos, many poses at once (numba).
+
+Letters: V views, N points, K poses. A pose is R (3, 3) and c (3,): a point p of the old object is now at
+``R (p - p0) + c``, p0 the old centre. A view's lens is 25 numbers: cam_from_world R (9) and t (3), fx fy cx cy,
+k1 k2 p1 p2 k3, height, width, and its centre in the world's first two free slots (see `lens_of`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+_F32 = NDArray[np.float32]
+_F64 = NDArray[np.float64]
+
+
+@njit(cache=True, fastmath=True)
+def _project(lens: _F64, x: float, y: float, z: float, out: _F64) -> bool:
+    """World point -> out = (u, v, X, Y, Z, distance) with X Y Z in camera axes; False if outside the image."""
+    xc = lens[0] * x + lens[1] * y + lens[2] * z + lens[9]
+    yc = lens[3] * x + lens[4] * y + lens[5] * z + lens[10]
+    zc = lens[6] * x + lens[7] * y + lens[8] * z + lens[11]
+    if zc <= 1e-6:
+        return False
+    a, b = xc / zc, yc / zc
+    r2 = a * a + b * b
+    radial = 1 + r2 * (lens[16] + r2 * (lens[17] + r2 * lens[20]))
+    da = a * radial + 2 * lens[18] * a * b + lens[19] * (r2 + 2 * a * a)
+    db = b * radial + lens[18] * (r2 + 2 * b * b) + 2 * lens[19] * a * b
+    u, v = lens[12] * da + lens[14], lens[13] * db + lens[15]
+    out[0], out[1], out[2], out[3], out[4] = u, v, xc, yc, zc
+    out[5] = math.sqrt(xc * xc + yc * yc + zc * zc)
+    return 1.0 < u < lens[22] - 1.0 and 1.0 < v < lens[21] - 1.0
+
+
+@njit(cache=True, fastmath=True)
+def _sample(image: _F32, u: float, v: float, out: _F64) -> None:
+    """Bilinear values of all channels at pixel position (u, v), centres at +0.5."""
+    x, y = u - 0.5, v - 0.5
+    i, j = int(y), int(x)
+    fy, fx = y - i, x - j
+    for c in range(image.shape[2]):
+        top = image[i, j, c] * (1 - fx) + image[i, j + 1, c] * fx
+        bottom = image[i + 1, j, c] * (1 - fx) + image[i + 1, j + 1, c] * fx
+        out[c] = top * (1 - fy) + bottom * fy
+
+
+@njit(cache=True, fastmath=True)
+def _rodrigues(w: _F64) -> _F64:
+    angle = math.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
+    a, b = 1.0, 0.5
+    if angle > 1e-6:
+        a, b = math.sin(angle) / angle, (1 - math.cos(angle)) / angle**2
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = b * w[i] * w[j]
+        out[i, i] += 1 - b * angle**2
+    out[0, 1] -= a * w[2]
+    out[0, 2] += a * w[1]
+    out[1, 0] += a * w[2]
+    out[1, 2] -= a * w[0]
+    out[2, 0] -= a * w[1]
+    out[2, 1] += a * w[0]
+    return out
+
+
+@njit(cache=True, fastmath=True)
+def _step(
+    points: _F64, colours: _F32, lenses: _F64, images: _F32, depths: _F32, r: _F64, c: _F64, scale: float, radius: float
+) -> bool:
+    """One damped Gauss–Newton step on the photos' colours at the points; changes r and c in place."""
+    h, g = np.zeros((6, 6)), np.zeros(6)
+    at, px = np.zeros(6), np.zeros(9)
+    row = np.zeros(6)
+    for n in range(points.shape[0]):
+        qx = r[0, 0] * points[n, 0] + r[0, 1] * points[n, 1] + r[0, 2] * points[n, 2]
+        qy = r[1, 0] * points[n, 0] + r[1, 1] * points[n, 1] + r[1, 2] * points[n, 2]
+        qz = r[2, 0] * points[n, 0] + r[2, 1] * points[n, 1] + r[2, 2] * points[n, 2]
+        nx = r[0, 0] * points[n, 3] + r[0, 1] * points[n, 4] + r[0, 2] * points[n, 5]
+        ny = r[1, 0] * points[n, 3] + r[1, 1] * points[n, 4] + r[1, 2] * points[n, 5]
+        nz = r[2, 0] * points[n, 3] + r[2, 1] * points[n, 4] + r[2, 2] * points[n, 5]
+        for v in range(lenses.shape[0]):
+            lens = lenses[v]
+            x, y, z = qx + c[0], qy + c[1], qz + c[2]
+            vx, vy, vz = x - lens[23], y - lens[24], z - lens[25]
+            dist = math.sqrt(vx * vx + vy * vy + vz * vz)
+            cosine = -(nx * vx + ny * vy + nz * vz) / dist
+            if cosine < 0.2 or not _project(lens, x, y, z, at):
+                continue
+            if dist > depths[v, int(at[1]), int(at[0])] + 0.3 * radius:
+                continue
+            _sample(images[v], at[0], at[1], px)
+            e0, e1, e2 = px[0] - colours[n, 0], px[1] - colours[n, 1], px[2] - colours[n, 2]
+            weight = cosine / (1 + (e0 * e0 + e1 * e1 + e2 * e2) / scale**2) ** 2
+            zi = 1 / at[4]
+            # d(u, v)/d(point in camera axes), the lens' distortion left out of the derivative
+            ux, uz = lens[12] * zi, -lens[12] * at[2] * zi * zi
+            wy, wz = lens[13] * zi, -lens[13] * at[3] * zi * zi
+            for k in range(3):
+                gu, gv = px[3 + 2 * k], px[4 + 2 * k]
+                a, b, d = gu * ux, gv * wy, gu * uz + gv * wz
+                jx = a * lens[0] + b * lens[3] + d * lens[6]
+                jy = a * lens[1] + b * lens[4] + d * lens[7]
+                jz = a * lens[2] + b * lens[5] + d * lens[8]
+                row[0], row[1], row[2] = jx * radius, jy * radius, jz * radius
+                row[3], row[4], row[5] = qy * jz - qz * jy, qz * jx - qx * jz, qx * jy - qy * jx
+                e = px[k] - colours[n, k]
+                for i in range(6):
+                    g[i] += weight * row[i] * e
+                    for j in range(i + 1):
+                        h[i, j] += weight * row[i] * row[j]
+    trace = 0.0
+    for i in range(6):
+        trace += h[i, i]
+        for j in range(i):
+            h[j, i] = h[i, j]
+    if trace <= 1e-12:
+        return False
+    for i in range(6):
+        h[i, i] += 0.02 * h[i, i] + 1e-3 * trace
+    s = -np.linalg.solve(h, g)
+    size = math.sqrt(s[0] ** 2 + s[1] ** 2 + s[2] ** 2 + s[3] ** 2 + s[4] ** 2 + s[5] ** 2)
+    if size > 0.35:
+        s *= 0.35 / size
+    for i in range(3):
+        c[i] += s[i] * radius
+    turn, old = _rodrigues(s[3:]), r.copy()
+    for i in range(3):
+        for j in range(3):
+            r[i, j] = turn[i, 0] * old[0, j] + turn[i, 1] * old[1, j] + turn[i, 2] * old[2, j]
+    return size > 1e-4
+
+
+@njit(cache=True, fastmath=True)
+def _score(
+    points: _F64, colours: _F32, lenses: _F64, images: _F32, depths: _F32, targets: _F32, r: _F64, c: _F64,
+    cap: float, radius: float, block: int,
+) -> float:
+    """Mean capped colour error of the visible points plus the part of the target pixels that stay uncovered."""
+    error, total, uncovered, wanted = 0.0, 0.0, 0.0, 0.0
+    at, px = np.zeros(6), np.zeros(9)
+    for v in range(lenses.shape[0]):
+        lens = lenses[v]
+        rows, cols = int(lens[21]) // block + 1, int(lens[22]) // block + 1
+        covered = np.zeros((rows, cols), np.uint8)
+        for n in range(points.shape[0]):
+            x = r[0, 0] * points[n, 0] + r[0, 1] * points[n, 1] + r[0, 2] * points[n, 2] + c[0]
+            y = r[1, 0] * points[n, 0] + r[1, 1] * points[n, 1] + r[1, 2] * points[n, 2] + c[1]
+            z = r[2, 0] * points[n, 0] + r[2, 1] * points[n, 1] + r[2, 2] * points[n, 2] + c[2]
+            nx = r[0, 0] * points[n, 3] + r[0, 1] * points[n, 4] + r[0, 2] * points[n, 5]
+            ny = r[1, 0] * points[n, 3] + r[1, 1] * points[n, 4] + r[1, 2] * points[n, 5]
+            nz = r[2, 0] * points[n, 3] + r[2, 1] * points[n, 4] + r[2, 2] * points[n, 5]
+            vx, vy, vz = x - lens[23], y - lens[24], z - lens[25]
+            dist = math.sqrt(vx * vx + vy * vy + vz * vz)
+            cosine = -(nx * vx + ny * vy + nz * vz) / dist
+            if cosine < 0.1 or not _project(lens, x, y, z, at):
+                continue
+            i, j = int(at[1]), int(at[0])
+            covered[i // block, j // block] = 1
+            if cosine < 0.2 or dist > depths[v, i, j] + 0.3 * radius:
+                continue
+            total += cosine
+            if targets[v, i, j] < 0:  # certainly unchanged: nothing can be in front here
+                error += cosine
+                continue
+            _sample(images[v], at[0], at[1], px)
+            e = (px[0] - colours[n, 0]) ** 2 + (px[1] - colours[n, 1]) ** 2 + (px[2] - colours[n, 2]) ** 2
+            error += cosine * min(1.0, e / cap**2)
+        for i in range(int(lens[21])):
+            for j in range(int(lens[22])):
+                t = targets[v, i, j]
+                if t > 0:
+                    wanted += t
+                    if covered[i // block, j // block] == 0:
+                        uncovered += t
+    if total < 5:
+        return 2.0
+    return error / total + 0.7 * uncovered / max(wanted, 1.0)
+
+
+@njit(cache=True, parallel=True, fastmath=True)
+def register_all(
+    points: _F64, colours: _F32, lenses: _F64, images: _F32, depths: _F32, targets: _F32, rotations: _F64,
+    centres: _F64, steps: int, scale: float, cap: float, radius: float, block: int,
+) -> _F64:
+    """Improve K poses by ``steps`` steps each and score them: rotations (K, 3, 3), centres (K, 3) in place -> (K,)."""
+    out = np.zeros(rotations.shape[0])
+    for k in prange(rotations.shape[0]):
+        for _ in range(steps):
+            if not _step(points, colours, lenses, images, depths, rotations[k], centres[k], scale, radius):
+                break
+        out[k] = _score(
+            points, colours, lenses, images, depths, targets, rotations[k], centres[k], cap, radius, block
+        )
+    return out

@@ -1,0 +1,180 @@
+"""The change hull in 3-D: where something was and is not, where something is and was not.
+
+A voxel that lies in the change mask of every view that sees it is in the hull. In the hull and solid in the old field:
+something *was* there; in the hull and empty in the old field: something *is* there now. "Solid" means that no old
+view looks through it, so an opaque thing's inside counts, whatever the field holds there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from refield.estimate.detect import Changed, Mask
+from refield.estimate.lattice import Lattice, Voxels
+from refield.estimate.look import Array, View
+from refield.vision import pixels
+
+
+@dataclass(frozen=True)
+class HullConfig:
+    """How the change hull is carved."""
+
+    longest: int = 96
+    """voxels along the longest side"""
+    ray_steps: int = 64
+    """samples along each changed pixel's ray when looking for where the hull is"""
+    margin: int = 1
+    """pixels the change masks are grown by before carving"""
+    surface: float = 1.5
+    """pixels; a point this close to the old surface is on it"""
+    smallest: int = 40
+    """voxels; smaller parts are dropped"""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Points x with ``normal @ x == offset``; the cameras are on the positive side."""
+
+    normal: Array
+    offset: float
+    noise: float
+    """rms distance of its points, world units"""
+
+    def height(self, points: Array) -> Array:
+        return points @ self.normal - np.float32(self.offset)
+
+
+@dataclass(frozen=True)
+class Hull:
+    """The carved change."""
+
+    lattice: Lattice
+    hull: Voxels
+    """in the change mask of every view that sees it"""
+    solid: Voxels
+    """no old view looks through it"""
+    unchanged: Voxels
+    """some new view shows it as it was"""
+
+
+def tolerance(view: View, distance: Array, config: HullConfig) -> Array:
+    """How far from the old surface a point may be and still be on it, world units."""
+    return (config.surface * view.pixel_angle * distance).astype(np.float32)
+
+
+def votes(points: Array, seen: Sequence[tuple[View, Mask]], config: HullConfig) -> tuple[Array, Array]:
+    """How many views show each point (N, 3) in their mask, and how many contradict that it changed.
+
+    A view contradicts where its mask does not hold the point and the old surface there is not in front of it.
+    """
+    inside_count, against = np.zeros(len(points), np.int16), np.zeros(len(points), np.int16)
+    for view, mask in seen:
+        uv, distance, inside = view.project(points)
+        in_mask = view.lookup(mask, uv, inside) & inside
+        front = view.lookup(view.depth, uv, inside)
+        in_sight = inside & (distance < front + tolerance(view, distance, config))
+        inside_count += in_mask
+        against += in_sight & ~in_mask
+    return inside_count, against
+
+
+def seen_through(points: Array, views: Sequence[View], config: HullConfig) -> NDArray[np.int16]:
+    """How many old renderings look through each point (N, 3), by their nearest depth among the pixels around."""
+    count = np.zeros(len(points), np.int16)
+    for view in views:
+        uv, distance, inside = view.project(points)
+        front = view.lookup(view.depth, uv, inside)
+        count += inside & (distance < front - tolerance(view, distance, config))
+    return count
+
+
+def find_region(changed: Sequence[Changed], config: HullConfig) -> Lattice | None:
+    """The lattice that holds everything that may be in the hull; None if no point can be."""
+    seen = [(c.view, pixels.dilate(c.mask, config.margin)) for c in changed]
+    needed = min(2, len(changed))
+    kept = []
+    for c in changed:
+        points = _points_before_surface(c, config)
+        if len(points) == 0:
+            continue
+        inside, against = votes(points, seen, config)
+        kept.append(points[(inside >= needed) & (against == 0)])
+    points = np.concatenate(kept) if kept else np.zeros((0, 3), np.float32)
+    if len(points) < 20:
+        return None
+    low, high = np.quantile(points, 0.002, axis=0), np.quantile(points, 0.998, axis=0)
+    pad = 0.06 * float((high - low).max())
+    return Lattice.over((low - pad).astype(np.float32), (high + pad).astype(np.float32), config.longest)
+
+
+def _points_before_surface(c: Changed, config: HullConfig, at_most: int = 2500) -> Array:
+    ys, xs = np.nonzero(c.mask)
+    if len(ys) == 0:
+        return np.zeros((0, 3), np.float32)
+    pick = np.linspace(0, len(ys) - 1, min(at_most, len(ys))).astype(int)
+    d, depth = c.view.directions[ys[pick], xs[pick]], c.view.depth[ys[pick], xs[pick]]
+    finite = c.view.depth[np.isfinite(c.view.depth)]
+    far = float(np.quantile(finite, 0.95)) if len(finite) else 1.0
+    reach = np.minimum(depth, far) * 1.05
+    t = np.linspace(0.1, 1.0, config.ray_steps, dtype=np.float32)
+    return (c.view.centre + d[:, None] * (reach[:, None] * t)[..., None]).reshape(-1, 3).astype(np.float32)
+
+
+def carve(
+    lattice: Lattice, seen: Sequence[tuple[View, Mask]], old: Sequence[View], config: HullConfig
+) -> Hull:
+    """The hull on a lattice, from the new views' masks and the old renderings."""
+    points = lattice.centres.reshape(-1, 3)
+    inside, against = votes(points, [(v, pixels.dilate(m, config.margin)) for v, m in seen], config)
+    hull = (inside >= min(2, len(seen))) & (against == 0)
+    solid = seen_through(points, old, config) == 0
+    shape = lattice.shape
+    return Hull(lattice, hull.reshape(shape), solid.reshape(shape), (against > 0).reshape(shape))
+
+
+def support_planes(points: Array, cameras: Array, tol: float, seed: int = 0) -> list[Plane]:
+    """Planes that hold up what stands on them: many points on it, hardly any behind, the cameras in front."""
+    rng = np.random.default_rng(seed)
+    rest, planes, total = points, [], len(points)
+    for _ in range(3):
+        if len(rest) < max(50, 0.12 * total):
+            break
+        plane, on = _best_plane(rest, points, cameras, tol, rng)
+        if plane is None or on.sum() < 0.12 * total:
+            break
+        planes.append(plane)
+        rest = rest[~on]
+    return planes
+
+
+def _best_plane(
+    rest: Array, points: Array, cameras: Array, tol: float, rng: np.random.Generator
+) -> tuple[Plane | None, Mask]:
+    triples = rest[rng.integers(len(rest), size=(400, 3))]
+    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    length = np.linalg.norm(normals, axis=-1)
+    normals, triples = normals[length > 1e-12] / length[length > 1e-12, None], triples[length > 1e-12]
+    offsets = (normals * triples[:, 0]).sum(-1)
+    side = np.sign(np.median(cameras @ normals.T - offsets, axis=0))
+    normals, offsets = normals * side[:, None], offsets * side
+    heights = points @ normals.T - offsets
+    behind = (heights < -2.5 * tol).mean(0)
+    on_count = (np.abs(rest @ normals.T - offsets) < tol).sum(0)
+    allowed = (behind < 0.03) & ((cameras @ normals.T - offsets) > 0).all(0)
+    if not allowed.any():
+        return None, np.zeros(len(rest), bool)
+    best = int(np.where(allowed, on_count, -1).argmax())
+    normal, offset = normals[best], float(offsets[best])
+    for _ in range(3):
+        on = np.abs(rest @ normal - offset) < tol
+        centre = rest[on].mean(0)
+        axis = np.linalg.svd(rest[on] - centre, full_matrices=False)[2][2]
+        normal = axis if axis @ normal > 0 else -axis
+        offset = float(normal @ centre)
+    on = np.abs(rest @ normal - offset) < tol
+    noise = float(np.sqrt(((rest[on] @ normal - offset) ** 2).mean()))
+    return Plane(normal.astype(np.float32), offset, noise), on

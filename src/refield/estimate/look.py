@@ -1,0 +1,198 @@
+"""What the old field shows from a camera, beside what was photographed there.
+
+Unlike a plain rendering the depth here is the *median* along the ray, where half of the light is stopped: at an
+object's edge it belongs to the object or to what is behind, never in between. Everything is in the world frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from refield.field.radiance import Field
+from refield.field.volrend import Samples, composite, weights
+from refield.scene.camera import Camera
+from refield.scene.capture import Frame, Rays, camera_rays
+from refield.scene.images import frame_image
+
+Hidden = Callable[[Tensor], Tensor]
+"""World points (S, 3) -> (S,) bool: samples to leave out."""
+Array = NDArray[np.float32]
+
+_CHUNK = 8192
+_NEGLIGIBLE = 1e-3  # weight of a sample whose colour is not asked for; the sum of what is lost stays below a grey level
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What N rays meet."""
+
+    rgb: Tensor
+    """(N, 3) float32"""
+    depth: Tensor
+    """(N,) float32 median distance along the unit direction; inf where less than half the light is stopped"""
+    opacity: Tensor
+    """(N,) float32"""
+
+
+def see(field: Field, rays: Rays, hidden: Hidden | None = None) -> Seen:
+    """Colour, median depth and opacity of rays through the field, without the samples that are ``hidden``."""
+    with torch.no_grad():
+        parts = [_see(field, rays[i : i + _CHUNK], hidden) for i in range(0, len(rays), _CHUNK)]
+    return Seen(
+        torch.cat([p.rgb for p in parts]), torch.cat([p.depth for p in parts]), torch.cat([p.opacity for p in parts])
+    )
+
+
+def _see(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
+    samples = field.sampler(rays)
+    x, d = samples.positions(rays)
+    sigmas = field.density(x)
+    if hidden is not None:
+        sigmas = torch.where(hidden(x), torch.zeros_like(sigmas), sigmas)
+    return shaded(field, (x, d), sigmas, samples)
+
+
+def shaded(field: Field, at: tuple[Tensor, Tensor], sigmas: Tensor, samples: Samples) -> Seen:
+    """Composite samples whose densities are known; colours are asked for only where they count."""
+    w = weights(sigmas, samples)
+    count = (w > _NEGLIGIBLE).nonzero()[:, 0]
+    rgbs = torch.zeros(len(w), 3)
+    if len(count):
+        rgbs[count] = field(at[0][count], at[1][count])[1]
+    rendering = composite(sigmas, rgbs, samples)
+    return Seen(rendering.rgb, median_depth(sigmas, samples), rendering.opacity)
+
+
+def median_depth(sigmas: Tensor, samples: Samples) -> Tensor:
+    """Distance at which the transmittance falls below one half, linear in optical depth within the sample; (N,)."""
+    n = len(samples.ray_offsets) - 1
+    out = torch.full((n,), torch.inf)
+    if len(samples) == 0:
+        return out
+    delta = samples.t_ends - samples.t_starts
+    optical = (sigmas * delta).double()
+    after = optical.cumsum(0)
+    start = torch.cat([after.new_zeros(1), after])[samples.ray_offsets[:-1]]
+    goal = start + float(np.log(2.0))
+    index = torch.searchsorted(after, goal).clamp_max(len(samples) - 1)
+    found = (index < samples.ray_offsets[1:]) & (after[index] >= goal)
+    before = after[index] - optical[index]
+    part = ((goal - before) / optical[index].clamp_min(1e-12)).clamp(0, 1).float()
+    return torch.where(found, samples.t_starts[index] + part * delta[index], out)
+
+
+@dataclass(frozen=True)
+class View:
+    """One posed photo beside the old field's rendering of it, at working resolution."""
+
+    frame: Frame
+    camera: Camera
+    """the frame's, scaled to the working resolution"""
+    photo: Array
+    """(H, W, 3) as taken, until `detect` carries its colours to the field's"""
+    rgb: Array
+    """(H, W, 3) the field's"""
+    depth: Array
+    """(H, W) median distance; inf where the field is empty"""
+    opacity: Array
+    """(H, W)"""
+    colour_fit: NDArray[np.float64] = field(default_factory=lambda: np.stack([np.ones(3), np.zeros(3)]))
+    """(2, 3) gain and offset that carried the photo's colours to the field's"""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.camera.height, self.camera.width
+
+    @cached_property
+    def centre(self) -> Array:
+        """Camera centre (3,)."""
+        return self.frame.world_from_cam[:3, 3].numpy().astype(np.float32)
+
+    @cached_property
+    def rays(self) -> Rays:
+        """One ray a pixel, row by row."""
+        return camera_rays(self.camera, self.frame.world_from_cam)
+
+    @cached_property
+    def directions(self) -> Array:
+        """(H, W, 3) unit."""
+        return self.rays.directions.numpy().reshape(*self.shape, 3)
+
+    @cached_property
+    def surface(self) -> Array:
+        """World point under each pixel, (H, W, 3); not finite where the field is empty."""
+        with np.errstate(invalid="ignore"):
+            return self.centre + self.directions * self.depth[..., None]
+
+    @cached_property
+    def pixel_angle(self) -> float:
+        """Width of a pixel in radians, at the middle of the image."""
+        return 1.0 / self.camera.fx
+
+    def project(self, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """World (..., 3) -> pixels (..., 2), distances (...,) along the ray, and whether inside the image."""
+        m = self.frame.world_from_cam
+        x = torch.from_numpy(np.ascontiguousarray(points, np.float32))
+        local = (x - m[:3, 3].float()) @ m[:3, :3].float()
+        uv, z = self.camera.project(local)
+        h, w = self.shape
+        inside = (z > 1e-6) & (uv >= 0).all(-1) & (uv[..., 0] < w) & (uv[..., 1] < h)
+        return uv.numpy(), local.norm(dim=-1).numpy(), inside.numpy()
+
+    def lookup(self, image: NDArray[np.generic], uv: Array, inside: NDArray[np.bool_]) -> NDArray[np.generic]:
+        """Nearest pixel's value at ``uv`` (..., 2); that of pixel (0, 0) outside the image."""
+        j = np.where(inside, uv[..., 0], 0).astype(np.int64)
+        i = np.where(inside, uv[..., 1], 0).astype(np.int64)
+        return image[i, j]
+
+
+def working_camera(camera: Camera, max_pixels: int) -> Camera:
+    """The camera scaled down so that an image has at most ``max_pixels``."""
+    shrink = min(1.0, (max_pixels / (camera.width * camera.height)) ** 0.5)
+    return camera.scaled(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
+
+
+def load_photo(frame: Frame, camera: Camera) -> Array:
+    """The frame's image as (H, W, 3) float32 in [0, 1], resampled to ``camera``."""
+    image = frame_image(frame).numpy()
+    if image.shape[:2] != (camera.height, camera.width):
+        image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return image.astype(np.float32) / 255
+
+
+def view_of(radiance: Field, frame: Frame, max_pixels: int) -> View:
+    """Load one photo and render the old field beside it."""
+    camera = working_camera(frame.camera, max_pixels)
+    seen = see(radiance, camera_rays(camera, frame.world_from_cam))
+    shape = (camera.height, camera.width)
+    return View(
+        frame,
+        camera,
+        load_photo(frame, camera),
+        seen.rgb.reshape(*shape, 3).clamp(0, 1).numpy(),
+        seen.depth.reshape(shape).numpy(),
+        seen.opacity.reshape(shape).numpy(),
+    )
+
+
+def spread_out(frames: Sequence[Frame], count: int) -> list[Frame]:
+    """``count`` frames that differ most in where they stand and look, by farthest-point choice."""
+    if len(frames) <= count:
+        return list(frames)
+    centres = torch.stack([f.centre for f in frames])
+    scale = (centres - centres.mean(0)).norm(dim=-1).mean().clamp_min(1e-9)
+    signature = torch.cat([centres / scale, torch.stack([f.world_from_cam[:3, 2] for f in frames])], -1)
+    chosen = [0]
+    nearest = (signature - signature[0]).norm(dim=-1)
+    while len(chosen) < count:
+        chosen.append(int(nearest.argmax()))
+        nearest = torch.minimum(nearest, (signature - signature[chosen[-1]]).norm(dim=-1))
+    return [frames[i] for i in sorted(chosen)]

@@ -1,0 +1,264 @@
+"""An object as it was: its solid shape, carved by every old view, and its coloured surface.
+
+The paper asks a segmenter for the object in every old photo and keeps the grid points that fall inside (§10.2.4); here
+the field itself says what each old view sees, so that the projection check needs no segmenter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from refield.estimate.hull import Plane
+from refield.estimate.lattice import Lattice, Voxels, components, grown
+from refield.estimate.look import Array, Hidden, see
+from refield.field.radiance import Field
+from refield.scene.camera import Camera
+from refield.scene.capture import Frame, Rays, camera_rays
+from refield.scene.change import OccupancyGrid
+
+
+@dataclass(frozen=True)
+class ObjectConfig:
+    """How an object's shape is found."""
+
+    longest: int = 72
+    """voxels along the longest side of the box around the object"""
+    box: float = 1.6
+    """size of that box relative to the changed part"""
+    rays: int = 90_000
+    """looked along, over all old views together"""
+    through: float = 0.05
+    """a voxel is empty if more than this part of the old views that look at it look through it"""
+    points: int = 1500
+    """on the coloured surface"""
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A rectangle of one old view, and what the field shows in it."""
+
+    frame: Frame
+    camera: Camera
+    """the frame's, scaled"""
+    box: tuple[int, int, int, int]
+    """x0, y0, x1, y1 in pixels of ``camera``"""
+    rgb: Array
+    """(h, w, 3)"""
+    depth: Array
+    """(h, w)"""
+
+    @property
+    def centre(self) -> Array:
+        return self.frame.world_from_cam[:3, 3].numpy().astype(np.float32)
+
+    @property
+    def rays(self) -> Rays:
+        return patch_rays(self.camera, self.frame, self.box)
+
+    @property
+    def points(self) -> Array:
+        """World points (h, w, 3) on the surface."""
+        d = self.rays.directions.numpy().reshape(*self.depth.shape, 3)
+        with np.errstate(invalid="ignore"):
+            return (self.centre + d * self.depth[..., None]).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Coloured surface points of an object at its old place."""
+
+    points: Array
+    """(N, 3) world"""
+    normals: Array
+    """(N, 3) unit, outwards"""
+    colours: Array
+    """(N, 3) in [0, 1], the field's"""
+
+
+@dataclass(frozen=True)
+class Old:
+    """An object as it was."""
+
+    lattice: Lattice
+    voxels: Voxels
+    seen: Voxels
+    """voxels that at least one old view looks at"""
+    cloud: Cloud
+    patches: tuple[Patch, ...]
+
+    @property
+    def centre(self) -> Array:
+        return self.lattice.centres[self.voxels].mean(0)
+
+    @property
+    def radius(self) -> float:
+        """rms distance of its voxels from the centre, scaled to a ball's radius."""
+        p = self.lattice.centres[self.voxels]
+        return float(np.sqrt(((p - p.mean(0)) ** 2).sum(-1).mean() * 5 / 3))
+
+    @property
+    def volume(self) -> float:
+        return float(self.voxels.sum()) * self.lattice.cell**3
+
+    def grid(self) -> OccupancyGrid:
+        """Its mask M: a little smoothed, so that the trilinear half level is not a staircase."""
+        values = ndimage.gaussian_filter(self.voxels.astype(np.float32), 0.7)
+        return self.lattice.grid(values)
+
+    def hidden(self, margin: int = 1) -> Hidden:
+        """Whether points belong to the object, for looking past it."""
+        grid = self.lattice.grid(grown(self.voxels, margin).astype(np.float32))
+        return grid.contains
+
+
+def patch_rays(camera: Camera, frame: Frame, box: tuple[int, int, int, int]) -> Rays:
+    """Rays through the pixels of a rectangle, row by row."""
+    x0, y0, x1, y1 = box
+    v, u = torch.meshgrid(torch.arange(y0, y1) + 0.5, torch.arange(x0, x1) + 0.5, indexing="ij")
+    return camera_rays(camera, frame.world_from_cam, torch.stack([u, v], -1).reshape(-1, 2).double())
+
+
+def box_in(camera: Camera, frame: Frame, corners: Array, margin: int = 1) -> tuple[int, int, int, int] | None:
+    """The rectangle of an image that world points (N, 3) project to; None if it misses the image."""
+    m = frame.world_from_cam
+    local = (torch.from_numpy(corners).double() - m[:3, 3]) @ m[:3, :3]
+    if (local[:, 2] <= 1e-3).any():
+        return None
+    uv = camera.project(local)[0].numpy()
+    x0, y0 = np.floor(uv.min(0)).astype(int) - margin
+    x1, y1 = np.ceil(uv.max(0)).astype(int) + margin
+    x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, camera.width), min(y1, camera.height)
+    return (int(x0), int(y0), int(x1), int(y1)) if x1 - x0 >= 3 and y1 - y0 >= 3 else None
+
+
+def corners_of(low: Array, high: Array) -> Array:
+    """The eight corners of a box, (8, 3)."""
+    return np.array([[(low, high)[b >> a & 1][a] for a in range(3)] for b in range(8)], np.float32)
+
+
+def look_around(field: Field, frames: Sequence[Frame], corners: Array, rays: int) -> list[Patch]:
+    """The part of every old view that shows a box, scaled down evenly if it takes more than ``rays`` rays."""
+    boxes = [(f, box_in(f.camera, f, corners)) for f in frames]
+    total = sum((b[2] - b[0]) * (b[3] - b[1]) for _, b in boxes if b)
+    shrink = min(1.0, (rays / max(total, 1)) ** 0.5)
+    todo = []
+    for frame, _ in boxes:
+        c = frame.camera
+        camera = c if shrink == 1 else c.scaled(max(8, round(c.width * shrink)), max(8, round(c.height * shrink)))
+        box = box_in(camera, frame, corners)
+        if box is not None:
+            todo.append((frame, camera, box, patch_rays(camera, frame, box)))
+    if not todo:
+        return []
+    joined = Rays(torch.cat([t[3].origins for t in todo]), torch.cat([t[3].directions for t in todo]))
+    seen = see(field, joined)
+    out, at = [], 0
+    for frame, camera, box, r in todo:
+        shape = (box[3] - box[1], box[2] - box[0])
+        rgb = seen.rgb[at : at + len(r)].reshape(*shape, 3).numpy()
+        out.append(Patch(frame, camera, box, rgb, seen.depth[at : at + len(r)].reshape(shape).numpy()))
+        at += len(r)
+    return out
+
+
+def carve_solid(lattice: Lattice, patches: Sequence[Patch], through: float) -> tuple[Voxels, Voxels]:
+    """Voxels that the old views do not look through, and those that at least one looks at."""
+    points = torch.from_numpy(lattice.centres.reshape(-1, 3)).double()
+    looked, passed = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    for p in patches:
+        m = p.frame.world_from_cam
+        local = (points - m[:3, 3]) @ m[:3, :3]
+        uv, z = p.camera.project(local)
+        j, i = uv[:, 0].floor().long().numpy() - p.box[0], uv[:, 1].floor().long().numpy() - p.box[1]
+        h, w = p.depth.shape
+        inside = (z.numpy() > 0) & (i >= 0) & (i < h) & (j >= 0) & (j < w)
+        front = p.depth[np.where(inside, i, 0), np.where(inside, j, 0)]
+        distance = local.norm(dim=-1).numpy()
+        slack = 0.75 * lattice.cell
+        looked += inside & (distance < front + slack)
+        passed += inside & (distance < front - slack)
+    covered = sum(1 for _ in patches)
+    solid = passed <= max(0.0, through * min(covered, 1e9))
+    return solid.reshape(lattice.shape), (looked > 0).reshape(lattice.shape)
+
+
+def surface_cloud(lattice: Lattice, voxels: Voxels, patches: Sequence[Patch], count: int) -> Cloud:
+    """What the patches see of the voxels' surface, thinned evenly to about ``count`` points."""
+    near = grown(voxels, 1)
+    smooth = ndimage.gaussian_filter(voxels.astype(np.float32), 1.5)
+    slope = np.stack(np.gradient(smooth), -1)
+    points, colours, facing = [], [], []
+    for p in patches:
+        xyz = p.points.reshape(-1, 3)
+        on = lattice.holds(near, xyz) & np.isfinite(xyz).all(-1)
+        ijk, _ = lattice.index(xyz[on])
+        n = -slope[ijk[:, 0], ijk[:, 1], ijk[:, 2]]
+        n /= np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-9)
+        look = xyz[on] - p.centre
+        cosine = -(n * look).sum(-1) / np.linalg.norm(look, axis=-1)
+        good = cosine > 0.25  # what is seen at a grazing angle has its neighbour's colour
+        points.append(np.concatenate([xyz[on], n], -1)[good])
+        colours.append(p.rgb.reshape(-1, 3)[on][good])
+        facing.append(cosine[good])
+    if not points or sum(len(p) for p in points) == 0:
+        empty = np.zeros((0, 3), np.float32)
+        return Cloud(empty, empty, empty)
+    return _thinned(np.concatenate(points), np.concatenate(colours), np.concatenate(facing), count)
+
+
+def _thinned(points: Array, colours: Array, facing: Array, count: int) -> Cloud:
+    """The most frontal point of each cell of a lattice fine enough for ``count`` of them."""
+    order = np.argsort(-facing)
+    points, colours = points[order], colours[order]
+    xyz = points[:, :3]
+    extent = float((xyz.max(0) - xyz.min(0)).max()) + 1e-9
+    keep = np.arange(len(xyz))
+    for n in (128, 96, 72, 56, 44, 34, 26, 20):
+        cells = np.floor((xyz - xyz.min(0)) / extent * n).astype(np.int64)
+        _, keep = np.unique(cells @ np.array([1, 1 << 16, 1 << 32]), return_index=True)
+        if len(keep) <= count:
+            break
+    return Cloud(*(np.ascontiguousarray(a[keep], np.float32) for a in (xyz, points[:, 3:], colours)))
+
+
+def outline(
+    field: Field, frames: Sequence[Frame], seeds: tuple[Lattice, Voxels], planes: Sequence[Plane], config: ObjectConfig
+) -> Old | None:
+    """The whole object that the changed voxels belong to, or None if no old view shows one.
+
+    Args:
+        seeds: a lattice and the voxels on it that changed and were solid.
+        planes: what the object may stand on or lean against; not part of it.
+    """
+    corners_lo = seeds[0].centres[seeds[1]].min(0)
+    corners_hi = seeds[0].centres[seeds[1]].max(0)
+    middle, half = (corners_lo + corners_hi) / 2, (corners_hi - corners_lo) / 2
+    half = np.maximum(half * config.box, half + 3 * seeds[0].cell)
+    low, high = middle - half, middle + half
+    patches = look_around(field, frames, corners_of(low, high), config.rays)
+    if not patches:
+        return None
+    lattice = Lattice.over(low, high, config.longest)
+    solid, seen = carve_solid(lattice, patches, config.through)
+    for plane in planes:
+        solid &= plane.height(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
+    start = seeds[0].holds(grown(seeds[1], 1), lattice.centres) & solid
+    parts = [p for p in components(solid, 30) if (p & start).sum() > 0.3 * start.sum() or (p & start).sum() > 0.4 * p.sum()]
+    if not parts:
+        return None
+    voxels = np.logical_or.reduce(parts)
+    voxels = ndimage.binary_fill_holes(voxels)
+    cloud = surface_cloud(lattice, voxels, patches, config.points)
+    return Old(lattice, voxels, seen, cloud, tuple(patches)) if len(cloud.points) >= 30 else None
+
+
+def restricted(old: Old, voxels: Voxels, config: ObjectConfig) -> Old:
+    """The same object with other voxels."""
+    cloud = surface_cloud(old.lattice, voxels, old.patches, config.points)
+    return replace(old, voxels=voxels, cloud=cloud)

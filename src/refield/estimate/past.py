@@ -1,0 +1,137 @@
+"""Looking past an object that may be gone: what the old field shows behind it, and whether the photo agrees.
+
+This is what tells "something left" from "something came and hides what was there": behind what left, the photo shows
+what other old views know to be there. It also clears the change masks of what is explained, so that the hull of the
+newcomers is carved by newcomers only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from refield.estimate.detect import Changed, DetectConfig, Mask, blur_sigma
+from refield.estimate.hull import HullConfig, tolerance
+from refield.estimate.lattice import grown
+from refield.estimate.look import Array, View, see
+from refield.estimate.objects import Old
+from refield.field.radiance import Field
+from refield.vision import pixels
+
+
+@dataclass(frozen=True)
+class Past:
+    """A new view of the old field with some objects taken out."""
+
+    changed: Changed
+    rgb: Array
+    """(H, W, 3) the field's colours without the objects"""
+    depth: Array
+    """(H, W) median depth without the objects; inf where nothing is left"""
+    was: Mask
+    """pixels at which an object was taken out"""
+    known: Mask
+    """pixels at which what is behind was seen by some old photo (everywhere outside ``was``)"""
+    difference: Array
+    """(H, W) Lab difference of the photo and ``rgb``"""
+
+    @property
+    def view(self) -> View:
+        return self.changed.view
+
+    @property
+    def explained(self) -> Mask:
+        """Changed pixels that show what was behind."""
+        alike = (self.difference < self.changed.threshold).astype(np.uint8)
+        return self.changed.mask & self.known & cv2.medianBlur(alike, 5).astype(bool)
+
+    @property
+    def open(self) -> Mask:
+        """Changed pixels that something new must explain."""
+        return self.changed.mask & self.known & ~self.explained
+
+
+def look_past(
+    field: Field, changed: Sequence[Changed], survey: Sequence[View], olds: Sequence[Old], config: DetectConfig
+) -> list[Past]:
+    """Render the new views without ``olds``; only rays that meet one are traced again."""
+    return [_look_past(field, c, survey, olds, config) for c in changed]
+
+
+def _look_past(
+    field: Field, c: Changed, survey: Sequence[View], olds: Sequence[Old], config: DetectConfig
+) -> Past:
+    view = c.view
+    was = np.zeros(view.shape, bool)
+    for old in olds:
+        was |= pixels.dilate(silhouette(view, old), 2)
+    rgb, depth = view.rgb.copy(), view.depth.copy()
+    index = np.flatnonzero(was.ravel())
+    if len(index):
+        tests = [old.hidden() for old in olds]
+        seen = see(field, view.rays[torch.from_numpy(index)], lambda x: torch.stack([t(x) for t in tests]).any(0))
+        rgb.reshape(-1, 3)[index] = seen.rgb.clamp(0, 1).numpy()
+        depth.reshape(-1)[index] = seen.depth.numpy()
+    hit = np.abs(np.where(np.isfinite(depth), depth, 0) - np.where(np.isfinite(view.depth), view.depth, 0))
+    gone = was & (hit > tolerance(view, np.where(np.isfinite(view.depth), view.depth, 0), HullConfig()))
+    known = ~was | (_seen_before(view, depth, survey) & ~_beneath(view, depth, olds))
+    sigma = blur_sigma(view, config)
+    diff = pixels.colour_difference(pixels.blur(view.photo, sigma), pixels.blur(rgb, sigma), config.reach)
+    return Past(c, rgb, depth, gone, known, diff)
+
+
+def _seen_before(view: View, depth: Array, survey: Sequence[View]) -> Mask:
+    """Pixels whose surface at ``depth`` some old view looks at."""
+    with np.errstate(invalid="ignore"):
+        points = (view.centre + view.directions * depth[..., None]).reshape(-1, 3)
+    finite = np.isfinite(points).all(-1)
+    points = np.where(finite[:, None], points, 0)
+    count = np.zeros(len(points), np.int16)
+    for old in survey:
+        uv, distance, inside = old.project(points)
+        front = old.lookup(old.depth, uv, inside)
+        count += inside & (np.abs(front - distance) < 2 * tolerance(old, distance, HullConfig()))
+    # an empty sky is known too: nothing was ever seen there
+    return ((finite & (count > 0)) | ~finite).reshape(view.shape)
+
+
+def _beneath(view: View, depth: Array, olds: Sequence[Old]) -> Mask:
+    """Pixels whose surface at ``depth`` touches one of the objects: nobody ever saw what they stood on."""
+    finite = np.isfinite(depth)
+    points = view.centre + view.directions * np.where(finite, depth, 0)[..., None]
+    out = np.zeros(view.shape, bool)
+    for old in olds:
+        out |= old.lattice.holds(grown(old.voxels, 4), points)
+    return out & finite
+
+
+def silhouette(view: View, old: Old) -> Mask:
+    """Pixels that show the object where the old field has it in front."""
+    near = old.lattice.grid(old.voxels.astype(np.float32))
+    points = torch.from_numpy(np.nan_to_num(view.surface, posinf=1e9, neginf=-1e9))
+    step = torch.from_numpy(view.directions) * old.lattice.cell
+    on = near.contains(points) | near.contains(points + step) | near.contains(points + 2 * step)
+    return pixels.close(on.numpy(), 3)
+
+
+def gone_score(past: Sequence[Past], old: Old) -> tuple[float, int]:
+    """How much better the photos agree with what is behind than with the object: (part of known pixels, pixels).
+
+    Only pixels are asked that show the object in the old field and whose background is known.
+    """
+    better, asked = 0, 0
+    for p in past:
+        here = silhouette(p.view, old) & p.was & p.known
+        stayed = p.changed.difference
+        asked += int(here.sum())
+        better += int((here & (p.difference < 0.7 * stayed) & p.changed.mask).sum())
+    return (better / asked if asked else 0.0), asked
+
+
+def silhouette_size(changed: Sequence[Changed], old: Old) -> int:
+    """Changed pixels that show the object, over all new views."""
+    return sum(int((silhouette(c.view, old) & c.mask).sum()) for c in changed)

@@ -1,0 +1,132 @@
+"""Small operations on images and masks: blur, colour difference, thresholds, morphology, boxes.
+
+Images are (H, W, 3) float32 RGB in [0, 1], masks (H, W) bool, numpy throughout.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_NEIGHBOURS = np.ones((3, 3), np.uint8)
+
+
+def blur(image: Image, sigma: float) -> Image:
+    """Gaussian blur; ``sigma`` in pixels, 0 leaves the image as it is."""
+    if sigma <= 0:
+        return image
+    return cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101)
+
+
+def to_lab(image: Image) -> Image:
+    """sRGB -> CIE Lab, L in 0-100: a difference of 1 is just visible."""
+    return cv2.cvtColor(np.clip(image, 0, 1).astype(np.float32), cv2.COLOR_RGB2LAB)
+
+
+def colour_difference(a: Image, b: Image, reach: int = 1) -> Image:
+    """Lab distance (H, W) between two images, forgiving shifts of up to ``reach`` pixels either way.
+
+    Each pixel of one image is compared with the most similar one near it in the other, both ways round; the
+    larger of the two counts, so that a thing present in only one of the images is seen whichever it is.
+    """
+    lab_a, lab_b = to_lab(a), to_lab(b)
+    return np.maximum(_nearest_distance(lab_a, lab_b, reach), _nearest_distance(lab_b, lab_a, reach))
+
+
+def _nearest_distance(a: Image, b: Image, reach: int) -> Image:
+    h, w = a.shape[:2]
+    padded = cv2.copyMakeBorder(b, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
+    best = np.full((h, w), np.inf, np.float32)
+    for dy in range(2 * reach + 1):
+        for dx in range(2 * reach + 1):
+            step = a - padded[dy : dy + h, dx : dx + w]
+            best = np.minimum(best, np.einsum("hwc,hwc->hw", step, step))
+    return np.sqrt(best)
+
+
+def otsu(values: Image, top: float) -> float:
+    """Otsu's threshold of values in [0, top]; larger ones count as ``top``."""
+    grey = np.clip(values.reshape(1, -1) * (255 / top), 0, 255).astype(np.uint8)
+    level, _ = cv2.threshold(grey, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
+    return float(level) * top / 255
+
+
+def dilate(mask: Mask, pixels: int = 1) -> Mask:
+    """Grow by ``pixels`` (3 x 3 square, repeated)."""
+    return cv2.dilate(mask.astype(np.uint8), _NEIGHBOURS, iterations=pixels).astype(bool) if pixels else mask
+
+
+def erode(mask: Mask, pixels: int = 1) -> Mask:
+    """Shrink by ``pixels`` (3 x 3 square, repeated); beyond the border counts as inside."""
+    return cv2.erode(mask.astype(np.uint8), _NEIGHBOURS, iterations=pixels).astype(bool) if pixels else mask
+
+
+def close(mask: Mask, size: int = 5) -> Mask:
+    """Morphological closing with a ``size`` x ``size`` kernel, one iteration (§10.2.4)."""
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)).astype(bool)
+
+
+def fill_holes(mask: Mask, largest: float) -> Mask:
+    """Fill enclosed holes of at most ``largest`` pixels."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] <= largest
+    small[0] = False
+    h, w = mask.shape
+    x0, y0 = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
+    at_border = (x0 == 0) | (y0 == 0) | (x0 + stats[:, 2] == w) | (y0 + stats[:, 3] == h)
+    return mask | (small & ~at_border)[labels] if count > 1 else mask
+
+
+def keep_components(mask: Mask, smallest: float, seeds: Mask | None = None) -> Mask:
+    """Components (8-connected) of at least ``smallest`` pixels that hold a seed, if seeds are given."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    keep = stats[:, cv2.CC_STAT_AREA] >= smallest
+    keep[0] = False
+    if seeds is not None:
+        keep &= np.bincount(labels[seeds & mask], minlength=count) > 0
+    return keep[labels]
+
+
+def bounding_box(mask: Mask, margin: int = 0) -> tuple[int, int, int, int] | None:
+    """(x0, y0, x1, y1), end exclusive, clipped to the image; None for an empty mask."""
+    ys, xs = np.nonzero(mask)
+    if len(xs) == 0:
+        return None
+    h, w = mask.shape
+    return (
+        max(int(xs.min()) - margin, 0),
+        max(int(ys.min()) - margin, 0),
+        min(int(xs.max()) + 1 + margin, w),
+        min(int(ys.max()) + 1 + margin, h),
+    )
+
+
+def fit_colours(source: Image, target: Image, rounds: int = 8) -> NDArray[np.float64]:
+    """Gain and offset per channel, (2, 3), that carry ``source`` to ``target`` where the two show the same.
+
+    Robust: iteratively reweighted, so that up to about half the pixels may show something else. Stays at
+    (1, 0) where the pixels say nothing (too dark, saturated or flat).
+    """
+    out = np.stack([np.ones(3), np.zeros(3)])
+    usable = ((source > 0.02) & (source < 0.98) & (target > 0.02) & (target < 0.98)).all(-1)
+    if usable.sum() < 50:
+        return out
+    x, y = source[usable].astype(np.float64), target[usable].astype(np.float64)
+    ratio = np.median(y / x, axis=0)
+    out[0] = np.where((ratio > 0.5) & (ratio < 2.0), ratio, 1.0)
+    prior = 0.02 * len(x)
+    for _ in range(rounds):
+        r = x * out[0] + out[1] - y
+        error = np.sqrt((r**2).sum(-1))
+        scale = max(float(np.median(error)) * 1.5, 0.01)
+        w = 1 / (1 + (error / scale) ** 2) ** 2
+        for c in range(3):
+            a = np.stack([x[:, c], np.ones(len(x))], -1)
+            normal = (a * w[:, None]).T @ a + np.diag([prior * 1e-3, prior * 1e-2])
+            rhs = (a * w[:, None]).T @ y[:, c] + np.array([prior * 1e-3, 0.0])
+            out[:, c] = np.linalg.solve(normal, rhs)
+    return out
