@@ -1,5 +1,9 @@
 """What several test files share: a workspace trained for a moment, once per run."""
 
+import os
+import sys
+from pathlib import Path
+
 import pytest
 
 from refield.cli import main
@@ -7,6 +11,10 @@ from tests.captures import write_capture
 
 TINY_FIT = ["--fit.steps", "3", "--fit.samples", "2048", "--fit.field.levels", "2"]
 TINY_FIT += ["--fit.field.log2-table", "8", "--fit.field.width", "8"]
+
+
+HERE = {**os.environ, "PYTHONPATH": os.pathsep.join(str(Path(p).resolve()) for p in sys.path)}
+"""The environment of a process that imports what this one imports."""
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """The commands join the stages: what they write, print and return."""
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -14,7 +13,7 @@ import torch
 from refield.cli import COMMANDS, main
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
 from refield.scene.images import read_image
-from tests.conftest import TINY_FIT
+from tests.conftest import HERE, TINY_FIT
 from tests.folders import contents
 
 update = pytest.importorskip("refield.commands.update")
@@ -30,7 +29,7 @@ def place(tiny, tmp_path, monkeypatch):
 
 def test_help_is_light_and_names_every_command():
     code = "import sys; from refield.cli import main; main(['--help']); assert 'torch' not in sys.modules"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=HERE)
     assert done.returncode == 0 and all(name in done.stdout for name in COMMANDS)
 
 
@@ -84,12 +83,12 @@ def believing(monkeypatch, *kinds):
         grid = OccupancyGrid(torch.tensor([[-0.3, -0.3, -0.3], [0.3, 0.3, 0.3]]), torch.ones(5, 5, 5))
         shift = torch.eye(4, dtype=torch.float64)
         shift[0, 3] = 0.5
-        empty = tuple(torch.zeros(24, 32, dtype=torch.bool) for _ in capture.train)
-        objects = tuple(
-            ObjectChange(k, grid, shift if k == "moved" else None, masks=empty, masks_in=empty) for k in kinds
-        )
         seen = torch.zeros(24, 32, dtype=torch.bool)
         seen[8:16, 10:20] = True
+        masks = (seen,) * len(capture.train)
+        objects = tuple(
+            ObjectChange(k, grid, shift if k == "moved" else None, masks=masks, masks_in=masks) for k in kinds
+        )
         photos = tuple(PlacedPhoto(f.name, "used", "", f) for f in frames[:3])
         photos += (PlacedPhoto(frames[3].name, "rejected", "blurred"),)
         return SceneChange(objects, photos, "because", (seen,) * 3, (seen,) * 3)
@@ -97,7 +96,7 @@ def believing(monkeypatch, *kinds):
     monkeypatch.setattr(update, "estimate_change", estimate)
 
 
-FEW = ["--update.steps", "2", "--update.samples", "512"]
+FEW = ["--update.steps", "2", "--update.samples", "512", "--update.no-relight"]
 
 
 def test_nothing_changed_writes_only_the_report(place, monkeypatch, capsys):
@@ -188,29 +187,27 @@ def test_faults_of_ours_keep_their_traceback(place, monkeypatch):
     assert not (place / "out").exists()
 
 
+def training(place):
+    """A training that would take for ever, in its own process, once it has begun."""
+    argv = [sys.executable, "-m", "refield", "train", "data", "out", "--fit.steps", "100000"]
+    process = subprocess.Popen(argv, cwd=place, stderr=subprocess.DEVNULL, env=HERE)
+    while process.poll() is None and not list(place.glob("out/.part-*/capture/transforms.json")):
+        time.sleep(0.05)
+    return process
+
+
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_signals_leave_no_half_workspace(place, number, code):
-    argv = [sys.executable, "-m", "refield", "train", "data", "out", "--fit.steps", "100000"]
-    process = subprocess.Popen(argv, cwd=place, stderr=subprocess.PIPE, text=True)
-    for _ in range(600):
-        if list(place.glob("out/.part-*/capture/transforms.json")):
-            break
-        time.sleep(0.1)
-    time.sleep(0.3)
+    process = training(place)
     process.send_signal(number)
     assert process.wait(timeout=60) == code
     assert not (place / "out").exists()
 
 
 def test_a_killed_training_is_no_workspace_and_can_be_repeated(place):
-    argv = [sys.executable, "-m", "refield", "train", "data", "out", "--fit.steps", "100000"]
-    process = subprocess.Popen(argv, cwd=place, stderr=subprocess.DEVNULL)
-    for _ in range(600):
-        if list(place.glob("out/.part-*/capture/transforms.json")):
-            break
-        time.sleep(0.1)
-    os.kill(process.pid, signal.SIGKILL)
+    process = training(place)
+    process.kill()
     process.wait()
-    assert not (place / "out/refield.json").exists()
+    assert list(place.glob("out/.part-*")) and not (place / "out/refield.json").exists()
     assert main(["train", "data", "out", *TINY_FIT]) == 0
     assert not list(place.glob("out/.part-*"))

@@ -15,7 +15,7 @@ from PIL import Image
 from refield.cli import main
 from refield.scene.images import write_image
 from tests.captures import CAMERA, write_capture
-from tests.conftest import TINY_FIT
+from tests.conftest import HERE, TINY_FIT
 from tests.folders import contents
 
 
@@ -199,7 +199,11 @@ def test_bad_input(place, monkeypatch, capsys, row):
 def test_exit_code_of_the_process(place):
     """The same through the real entry point, without a traceback."""
     done = subprocess.run(
-        [sys.executable, "-m", "refield", "update", "data", "new"], cwd=place, capture_output=True, text=True
+        [sys.executable, "-m", "refield", "update", "data", "new"],
+        cwd=place,
+        capture_output=True,
+        text=True,
+        env=HERE,
     )
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1 and "is not a refield workspace" in done.stderr
@@ -234,7 +238,7 @@ def test_numbers_do_not_depend_on_the_locale(place, locale):
         cwd=place,
         capture_output=True,
         text=True,
-        env={"LC_ALL": locale, "PYTHONPATH": ":".join(sys.path)},
+        env={**HERE, "LC_ALL": locale},
     )
     assert float(done.stdout) == CAMERA.fx
 

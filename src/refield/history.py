@@ -17,7 +17,7 @@ from refield.field.radiance import Field
 from refield.field.render import render_camera, render_many
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.images import frame_image, write_image
-from refield.update.composite import UpdatedField
+from refield.update.store import load_updated
 from refield.workspace import Workspace
 
 _SHOWS = 0.04
@@ -38,7 +38,7 @@ def state(workspace: Workspace, visit: int) -> Field:
     """
     field: Field = workspace.field()
     for number in changed_visits(workspace, visit):
-        field = UpdatedField.load(workspace.visit(number), field, workspace.change(number))
+        field = load_updated(workspace.visit(number), field, workspace.change(number))
     return field
 
 

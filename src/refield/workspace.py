@@ -190,7 +190,13 @@ class Workspace:
             sync_folder(base)
 
     def keep_change(self, folder: Path, change: SceneChange) -> SceneChange:
-        """Copy the used photos into a visit's folder and write the change; the change with the copies."""
+        """Copy the used photos into a visit's folder and write the change; the change with the copies.
+
+        Where nothing changed there is nothing to keep but that.
+        """
+        if not change.objects:
+            save_change(folder, replace(change, masks_in=(), masks_out=()))
+            return change
         frames = _copy_photos(folder / "photos", change.frames)
         if frames:
             save_transforms(folder / "photos" / "transforms.json", Capture(frames, held_out_every=0))

@@ -23,6 +23,7 @@ from refield.scene.errors import InputError
 from refield.scene.load import load_new_photos
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
+from refield.update.store import save_updated
 from refield.update.train import update_field
 from refield.workspace import Workspace
 
@@ -89,7 +90,7 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         with workspace.new_visit() as folder:
             workspace.keep_change(folder, change)
             if new is not None:
-                new.save(folder)
+                save_updated(folder, new)
             clock.stop()
             title = f"{options.work.resolve().name}, visit {number + 1}"
             write_report(folder, page(title, change, (old, new), clock, evaluation, facts or {}))

@@ -1,0 +1,64 @@
+"""An updated field's own part on disk: helper, region, light, sampler. Old field and change lie elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from refield.artefacts import read_tensors, write_tensors
+from refield.field.radiance import Field, HashField
+from refield.scene.change import OccupancyGrid, SceneChange
+from refield.scene.errors import InputError
+from refield.update.composite import UpdatedField
+from refield.update.light import Relighting
+from refield.update.region import Region
+
+_REMEDY = "restore the visit, or remove it and update again"
+
+
+def save_updated(folder: Path, field: UpdatedField) -> None:
+    """Write ``field.safetensors`` and ``field.json``.
+
+    Raises:
+        TypeError: the helper is no `HashField`, so there is no file for it.
+    """
+    tensors: dict[str, Tensor] = {"occupancy": field.sampler.grid}
+    facts: dict[str, Any] = {
+        "architecture": "UpdatedField",
+        "regions": len(field.region.grids),
+        "helper": None,
+    }
+    for i, grid in enumerate(field.region.grids):
+        tensors |= {f"region.{i}.aabb": grid.aabb, f"region.{i}.values": grid.values}
+    if field.light is not None:
+        tensors |= {"light.aabb": field.light.aabb, "light.log_gain": field.light.log_gain}
+    if field.helper is not None:
+        if not isinstance(field.helper, HashField):
+            raise TypeError(f"a helper of type {type(field.helper).__name__} cannot be saved")
+        own, facts["helper"] = field.helper.state()
+        tensors |= {f"helper.{name}": tensor for name, tensor in own.items()}
+    write_tensors(folder, tensors, facts)
+
+
+def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> UpdatedField:
+    """The updated field that `save_updated` wrote, over the field and the change that it was made from.
+
+    Raises:
+        InputError: a file is missing, damaged, or of another shape.
+    """
+    tensors, facts = read_tensors(folder)
+    try:
+        regions = range(facts["regions"])
+        grids = [OccupancyGrid(tensors[f"region.{i}.aabb"], tensors[f"region.{i}.values"]) for i in regions]
+        light = (
+            Relighting(tensors["light.aabb"], tensors["light.log_gain"]) if "light.aabb" in tensors else None
+        )
+        own = {name.removeprefix("helper."): t for name, t in tensors.items() if name.startswith("helper.")}
+        helper = HashField.from_state(own, facts["helper"]) if facts["helper"] is not None else None
+        sampler = replace(pretrained.sampler, grid=tensors["occupancy"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise InputError(folder, f"does not describe an updated field ({error})", _REMEDY) from None
+    return UpdatedField(pretrained, change, helper, region=Region(tuple(grids)), light=light, sampler=sampler)
