@@ -26,13 +26,15 @@ from refield.scene.capture import Capture, Frame, Rays
 class FitConfig:
     """Pre-training (§10.1.1)."""
 
-    steps: int = 1500
+    steps: int = 2500
     """of gradient descent"""
     max_seconds: float | None = None
     """stop in time: the learning rate follows whichever of steps and seconds is further on"""
-    samples: int = 65536
-    """a step; the number of rays follows from how many samples a ray needs. Large batches find geometry early"""
-    rate: float = 1e-2
+    samples: int = 8192
+    """a step; the number of rays follows from how many samples a ray needs, and behind the first surface it needs none"""
+    samples_per_ray: float = 40
+    """the lattice along the ray is made coarser, up to 1.5 times, while a ray needs more than this"""
+    rate: float = 2e-2
     """Adam's learning rate, held for the first half, then brought down to a thirtieth"""
     distortion: float = 1e-2
     """weight of the distortion loss; without it fog fills the grid"""
@@ -71,9 +73,12 @@ class NonFiniteError(RuntimeError):
 
 ProgressCallback = Callable[[FitProgress], None]
 _BAD_STEPS = 20
+COARSEST = 1.5  # times the final step along the ray
 
 
-def fit_field(capture: Capture, config: FitConfig = FitConfig(), on_progress: ProgressCallback | None = None) -> HashField:
+def fit_field(
+    capture: Capture, config: FitConfig = FitConfig(), on_progress: ProgressCallback | None = None
+) -> HashField:
     """Fit a field to the capture's training frames.
 
     Raises:
@@ -87,7 +92,9 @@ def fit_field(capture: Capture, config: FitConfig = FitConfig(), on_progress: Pr
         shape = replace(shape, finest=_finest_for(capture.train, contraction))
     step = contraction.radius * 4 / (shape.finest * 0.75)
     grid = torch.ones(128, 128, 128, dtype=torch.uint8)
-    model = HashField(shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), config.seed)
+    model = HashField(
+        shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), config.seed
+    )
     _Fit(model, capture, config, on_progress).run()
     return model.eval().requires_grad_(False)
 
@@ -161,7 +168,7 @@ class _Fit:
         self.samples_per_ray = config.samples / 512
         self.began = time.perf_counter()
         self.rays_done, self.bad = 0, 0
-        self.finest_step = model.sampler.step
+        self.finest_step, self.coarseness = model.sampler.step, COARSEST
 
     def run(self) -> None:
         self.model.train()
@@ -186,12 +193,10 @@ class _Fit:
         return max(step / self.config.steps, by_time)
 
     def _step(self, step: int, progress: float) -> None:
-        # while nothing is known to be empty, a coarse lattice reaches more rays with the same samples
-        coarse = 4 if step < 96 else 2 if step < 192 else 1
-        self.model.sampler = replace(self.model.sampler, step=self.finest_step * coarse)
+        self.model.sampler = replace(self.model.sampler, step=self.finest_step * self.coarseness)
         chosen = torch.randint(len(self.pixels), (self.rays_per_step,))
         rays = self.pixels.rays(chosen)
-        samples = self.model.sampler(rays, jitter=True)
+        samples = self.model.samples(rays, jitter=True)
         x, d = samples.positions(rays)
         radius = self.model.contraction.radius
         sigmas, rgbs = scale_gradients(*self.model(x, d), samples, self.config.gradient_unit * radius)
@@ -202,7 +207,7 @@ class _Fit:
         loss = colour_loss(rgb, self.pixels.colours(chosen))
         loss = loss + self.config.distortion * distortion_loss(w, samples, radius)
         self._descend(loss, progress)
-        self.occupancy.observe(step, x, w.detach())
+        self.occupancy.observe(step, x, w.detach(), sigmas.detach())
         self._resize(len(rays), len(samples))
 
     def _descend(self, loss: Tensor, progress: float) -> None:
@@ -220,8 +225,17 @@ class _Fit:
         """Aim at the wanted number of samples in the next step."""
         self.rays_done += rays
         self.samples_per_ray += 0.3 * (samples / rays - self.samples_per_ray)
+        # while little is known to be empty, a coarser lattice reaches more rays with the same samples
+        if self.samples_per_ray > self.config.samples_per_ray and self.coarseness < COARSEST:
+            self._set_coarseness(min(self.coarseness * 1.25, COARSEST))
+        elif self.samples_per_ray < 0.75 * self.config.samples_per_ray and self.coarseness > 1:
+            self._set_coarseness(max(self.coarseness / 1.25, 1.0))
         wanted = self.config.samples / max(self.samples_per_ray, 1.0)
         self.rays_per_step = int(min(max(wanted, 256), 16384))
+
+    def _set_coarseness(self, to: float) -> None:
+        self.samples_per_ray *= self.coarseness / to
+        self.coarseness = to
 
     def _look(self, step: int) -> float:
         psnr = self.judge.psnr(self.model)
@@ -231,7 +245,13 @@ class _Fit:
             left = seconds * (1 / max(self._progress(step), 1e-6) - 1)
             self.on_progress(
                 FitProgress(
-                    step, self.config.steps, psnr, self.rays_done / seconds, self.samples_per_ray, seconds, max(left, 0)
+                    step,
+                    self.config.steps,
+                    psnr,
+                    self.rays_done / seconds,
+                    self.samples_per_ray,
+                    seconds,
+                    max(left, 0),
                 )
             )
         return psnr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from refield.field import kernels
 from refield.field.pixels import PixelBank
@@ -12,35 +13,46 @@ from refield.field.render import CHUNK
 from refield.field.volrend import weights
 
 _EVERY = 16  # steps between updates
-_OPACITY = 1e-2  # a cell is kept if a sample in it would be more opaque than this
-_WEIGHT = 2e-3  # and if some ray gives it at least this much of its colour: hidden cells cost half of all samples
-_DECAY_OPACITY, _DECAY_WEIGHT = 0.95, 0.9
+_OPACITY = 5e-2  # a cell is kept if a sample in it would be more opaque than this
+_WEIGHT = (
+    5e-3  # and if some ray gives it at least this much of its colour: hidden cells cost half of all samples
+)
+_DECAY = 0.8
 
 
 class OccupancyTrainer:
-    """Two running maxima a cell: the opacity of a sample in it, and the weight that rays gave it."""
+    """Two running maxima a cell: the opacity of a sample in it, and the weight that rays gave it.
 
-    def __init__(self, model: HashField, cull_from: int = 256) -> None:
+    Both follow the training samples themselves; cells that are not sampled are probed at random, so that what was
+    taken for empty can come back.
+    """
+
+    def __init__(self, model: HashField, cull_from: int = 128) -> None:
         self.model, self.cull_from = model, cull_from
         cells = model.sampler.resolution**3
         self.opacity = torch.zeros(cells)
-        self.weight = torch.ones(cells)  # the benefit of the doubt
-        self.recent = torch.full((cells,), -1.0)  # since the last update; -1: no sample fell here
+        self.weight = torch.full((cells,), 16 * _WEIGHT)  # the benefit of the doubt
+        self.recent_weight = torch.full((cells,), -1.0)  # since the last update; -1: no sample fell here
+        self.recent_sigma = torch.zeros(cells)
         self.lengths = torch.cat([model.sampler.step_at(c) for c in torch.arange(cells).split(1 << 20)])
 
-    def observe(self, step: int, x: Tensor, w: Tensor) -> None:
-        """After each step: sample positions (S, 3) and their weights (S,). Updates the grid every 16 steps."""
-        kernels.scatter_max(w, self.model.sampler.cells(x), self.recent)
+    def observe(self, step: int, x: Tensor, w: Tensor, sigmas: Tensor) -> None:
+        """After each step: samples' positions (S, 3), weights (S,), densities (S,). Renews the grid every 16 steps."""
+        cells = self.model.sampler.cells(x)
+        kernels.scatter_max(w, cells, self.recent_weight)
+        kernels.scatter_max(sigmas, cells, self.recent_sigma)
         if step % _EVERY == _EVERY - 1:
             self._update(step)
 
     def _update(self, step: int) -> None:
-        self.opacity *= _DECAY_OPACITY
+        seen = self.recent_weight >= 0
+        opacity = -torch.expm1(-self.recent_sigma * self.lengths)
+        self.opacity = torch.where(seen, torch.maximum(self.opacity * _DECAY, opacity), self.opacity)
+        self.weight = torch.where(seen, torch.maximum(self.weight * _DECAY, self.recent_weight), self.weight)
+        self.recent_weight.fill_(-1.0)
+        self.recent_sigma.zero_()
         cells = self._cells_to_probe(step)
-        self.opacity[cells] = torch.maximum(self.opacity[cells], self._probe(cells))
-        seen = self.recent >= 0
-        self.weight = torch.where(seen, torch.maximum(self.weight * _DECAY_WEIGHT, self.recent), self.weight)
-        self.recent.fill_(-1.0)
+        self.opacity[cells] = torch.maximum(self.opacity[cells] * _DECAY, self._probe(cells))
         keep = self.opacity > min(_OPACITY, float(self.opacity.mean()))
         if step >= self.cull_from:
             # a few hidden cells get another chance, since geometry still changes
@@ -51,11 +63,7 @@ class OccupancyTrainer:
 
     def _cells_to_probe(self, step: int) -> Tensor:
         n = len(self.opacity)
-        if step < 4 * _EVERY:
-            return torch.randint(n, (n // 4,))
-        occupied = self.model.sampler.grid.reshape(-1).nonzero()[:, 0]
-        some = occupied[torch.randint(len(occupied), (min(n // 32, len(occupied)),))] if len(occupied) else occupied
-        return torch.cat([torch.randint(n, (n // 32,)), some])
+        return torch.randint(n, (n // 8 if step < 4 * _EVERY else n // 32,))
 
     def _probe(self, cells: Tensor) -> Tensor:
         with torch.no_grad():
@@ -65,7 +73,7 @@ class OccupancyTrainer:
     def _set(self, keep: Tensor) -> None:
         self.model.looking_where(keep.to(torch.uint8).reshape(self.model.sampler.grid.shape))
 
-    def settle(self, pixels: PixelBank, rays: int = 200_000) -> None:
+    def settle(self, pixels: PixelBank, rays: int = 100_000) -> None:
         """The final grid: every opaque cell that some training ray sees. Leaves the model in training mode."""
         everything = torch.arange(len(self.opacity))
         opaque = self.opacity > _OPACITY / 4
@@ -79,7 +87,12 @@ class OccupancyTrainer:
         with torch.no_grad():
             for part in chosen.split(CHUNK):
                 r = pixels.rays(part)
-                samples = self.model.sampler(r, jitter=True)
+                samples = self.model.samples(r, jitter=True)
                 x, _ = samples.positions(r)
-                kernels.scatter_max(weights(self.model.density(x), samples), self.model.sampler.cells(x), seen)
-        self._set(keep & (seen > _WEIGHT / 2))
+                kernels.scatter_max(
+                    weights(self.model.density(x), samples), self.model.sampler.cells(x), seen
+                )
+        # neighbours of what is seen stay too: a pinhole shows more than a few samples cost
+        shown = (torch.maximum(seen, self.weight) > _WEIGHT).reshape(1, 1, *self.model.sampler.grid.shape)
+        near = functional.max_pool3d(shown.float(), 3, stride=1, padding=1).reshape(-1) > 0
+        self._set(keep & near)

@@ -23,14 +23,6 @@ from refield.scene.errors import InputError
 FORMAT = 1
 
 
-class Sampler(Protocol):
-    """Proposes where along each ray the field may be non-empty."""
-
-    def __call__(self, rays: Rays, jitter: bool = False) -> Samples:
-        """Packed samples; ``jitter`` moves each ray's lattice by a random part of a step (training)."""
-        ...
-
-
 @runtime_checkable
 class Field(Protocol):
     """Density and colour anywhere in the world, and a sampler that knows where to look.
@@ -108,6 +100,11 @@ class HashField(nn.Module):
         rgb = torch.sigmoid(functional.linear(hidden, self.colour_out))
         sigma = self._where_seen(self._sigma(out[:, 0]), flat)
         return sigma.reshape(x.shape[:-1]), rgb.reshape(x.shape)
+
+    def samples(self, rays: Rays, jitter: bool = False) -> Samples:
+        """Where to evaluate the field along rays: the sampler's places, ended behind the first opaque surface."""
+        net = (self.encoding.tables, self.encoding.resolutions, self.density_in, self.density_out[0])
+        return self.sampler.visible(rays, net, jitter)
 
     def _hidden(self, flat: Tensor) -> Tensor:
         return functional.relu(functional.linear(self.encoding(self.contraction(flat)), self.density_in))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from refield.field.radiance import Field
+from refield.field.radiance import Field, HashField
 from refield.field.volrend import Rendering, composite
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
@@ -15,7 +15,7 @@ CHUNK = 16384  # rays; at 20 samples a ray the activations of a chunk take some 
 
 def render_rays(field: Field, rays: Rays, jitter: bool = False) -> Rendering:
     """Eq. 1 for N rays at once. Differentiable with respect to whatever the field is differentiable in."""
-    samples = field.sampler(rays, jitter)
+    samples = field.samples(rays, jitter) if isinstance(field, HashField) else field.sampler(rays, jitter)
     x, d = samples.positions(rays)
     sigmas, rgbs = field(x, d)
     return composite(sigmas, rgbs, samples)
@@ -26,7 +26,9 @@ def render_many(field: Field, rays: Rays, chunk: int = CHUNK) -> Rendering:
     with torch.no_grad():
         parts = [render_rays(field, rays[i : i + chunk]) for i in range(0, len(rays), chunk)]
     return Rendering(
-        torch.cat([p.rgb for p in parts]), torch.cat([p.depth for p in parts]), torch.cat([p.opacity for p in parts])
+        torch.cat([p.rgb for p in parts]),
+        torch.cat([p.depth for p in parts]),
+        torch.cat([p.opacity for p in parts]),
     )
 
 

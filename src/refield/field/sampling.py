@@ -10,6 +10,7 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.encoding import Contraction
+from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
 
@@ -34,12 +35,20 @@ class OccupancySampler:
 
     def __call__(self, rays: Rays, jitter: bool = False) -> Samples:
         """Packed samples of N rays; see `Samples`."""
+        with torch.no_grad():
+            return Samples(*kernels.march(*self._question(rays, jitter)))
+
+    def visible(self, rays: Rays, net: DensityNet, jitter: bool = False, stop: float = 7.0) -> Samples:
+        """As a call, but nothing behind the sample where the optical depth passes ``stop`` (e^-7 is a thousandth)."""
+        with torch.no_grad():
+            return Samples(*kernels.march_visible(*self._question(rays, jitter), net, stop))
+
+    def _question(self, rays: Rays, jitter: bool) -> tuple[Rays3, Space, Tensor, Lattice]:
         n = len(rays)
         shift = torch.rand(n, device=rays.origins.device) if jitter else rays.origins.new_zeros(n)
         lattice = (self.near, self.far * self.contraction.radius, self.step)
         space = (self.contraction.centre, self.contraction.radius)
-        with torch.no_grad():
-            return Samples(*kernels.march(rays.origins, rays.directions, space, self.grid, lattice, shift))
+        return (rays.origins, rays.directions, shift), space, self.grid, lattice
 
     def cells(self, x: Tensor) -> Tensor:
         """Flat index of the grid cell that holds each world point, (..., 3) -> (...,) int64."""
@@ -68,7 +77,11 @@ class OccupancySampler:
         return (ijk + (0.5 if offset is None else offset)) * (4 / r) - 2
 
     def refreshed(
-        self, density: Callable[[Tensor], Tensor], boxes: Iterable[Tensor], threshold: float = 1e-2, probes: int = 4
+        self,
+        density: Callable[[Tensor], Tensor],
+        boxes: Iterable[Tensor],
+        threshold: float = 1e-2,
+        probes: int = 4,
     ) -> OccupancySampler:
         """The same sampler with the cells that touch the world boxes (2, 3) looked up anew in ``density``.
 
@@ -76,11 +89,13 @@ class OccupancySampler:
         """
         grid = self.grid.clone()
         for box in boxes:
-            cells = self._cells_in(box)
+            cells = self.cells_in(box)
             grid.view(-1)[cells] = self._probe(density, cells, threshold, probes)
         return replace(self, grid=grid)
 
-    def _probe(self, density: Callable[[Tensor], Tensor], cells: Tensor, threshold: float, probes: int) -> Tensor:
+    def _probe(
+        self, density: Callable[[Tensor], Tensor], cells: Tensor, threshold: float, probes: int
+    ) -> Tensor:
         found = torch.zeros(len(cells), dtype=torch.bool, device=cells.device)
         length = self.step_at(cells)
         with torch.no_grad():
@@ -89,7 +104,7 @@ class OccupancySampler:
                 found |= density(x) * length > -torch.log1p(torch.tensor(-threshold))
         return found.to(self.grid.dtype)
 
-    def _cells_in(self, box: Tensor) -> Tensor:
+    def cells_in(self, box: Tensor) -> Tensor:
         """Flat indices of the cells whose contracted extent meets a world box (2, 3), one cell of margin."""
         r = self.resolution
         corners = torch.cartesian_prod(*torch.as_tensor(box, dtype=torch.float32).T)

@@ -11,6 +11,7 @@ from types import ModuleType
 from torch import Tensor
 
 from refield.field.kernels import reference
+from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 
 
 def _twin(t: Tensor) -> ModuleType:
@@ -51,12 +52,16 @@ def distortion(w: Tensor, s_starts: Tensor, s_ends: Tensor, offsets: Tensor) -> 
     return _twin(w).distortion(w, s_starts, s_ends, offsets)
 
 
-def march(
-    origins: Tensor, directions: Tensor, space: tuple[Tensor, float], grid: Tensor, lattice: tuple[float, float, float],
-    jitter: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
+def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.march`."""
-    return _twin(origins).march(origins, directions, space, grid, lattice, jitter)
+    return _twin(grid).march(rays, space, grid, lattice)
+
+
+def march_visible(
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: DensityNet, stop: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `reference.march_visible`."""
+    return _twin(grid).march_visible(rays, space, grid, lattice, net, stop)
 
 
 def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, step: int) -> None:

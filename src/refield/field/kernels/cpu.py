@@ -16,10 +16,13 @@ from torch import Tensor
 from torch.autograd import Function
 
 from refield.field.kernels import reference
+from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 
 _JIT = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "cache": True, "nogil": True}
 _P1, _P2 = np.uint32(reference.PRIMES[1]), np.uint32(reference.PRIMES[2])
-_BLOCK = 1024  # samples a thread takes at a time: their coordinates stay in L1 while a level's table stays in L2
+_BLOCK = (
+    1024  # samples a thread takes at a time: their coordinates stay in L1 while a level's table stays in L2
+)
 
 
 def _np(t: Tensor) -> np.ndarray:
@@ -110,9 +113,18 @@ def _encode_slope(unit, tables, resolutions, grad, out):  # type: ignore[no-unty
             fy = unit[s, 1] * res - min(max(int(unit[s, 1] * res), 0), res - 1)
             fz = unit[s, 2] * res - min(max(int(unit[s, 2] * res), 0), res - 1)
             gx, gy, gz = 1 - fx, 1 - fy, 1 - fz
-            sx += res * (gy * (gz * (v[4] - v[0]) + fz * (v[5] - v[1])) + fy * (gz * (v[6] - v[2]) + fz * (v[7] - v[3])))
-            sy += res * (gx * (gz * (v[2] - v[0]) + fz * (v[3] - v[1])) + fx * (gz * (v[6] - v[4]) + fz * (v[7] - v[5])))
-            sz += res * (gx * (gy * (v[1] - v[0]) + fy * (v[3] - v[2])) + fx * (gy * (v[5] - v[4]) + fy * (v[7] - v[6])))
+            sx += res * (
+                gy * (gz * (v[4] - v[0]) + fz * (v[5] - v[1]))
+                + fy * (gz * (v[6] - v[2]) + fz * (v[7] - v[3]))
+            )
+            sy += res * (
+                gx * (gz * (v[2] - v[0]) + fz * (v[3] - v[1]))
+                + fx * (gz * (v[6] - v[4]) + fz * (v[7] - v[5]))
+            )
+            sz += res * (
+                gx * (gy * (v[1] - v[0]) + fy * (v[3] - v[2]))
+                + fx * (gy * (v[5] - v[4]) + fy * (v[7] - v[6]))
+            )
         out[s, 0], out[s, 1], out[s, 2] = sx, sy, sz
 
 
@@ -294,45 +306,82 @@ def _cell_exit(u, d, cells, step):  # type: ignore[no-untyped-def]
     return best / step
 
 
+@njit(inline="always", **_JIT)
+def _optical_density(u, k, tables, resolutions, w_in, w_out, room):  # type: ignore[no-untyped-def]
+    """The density network's output at contracted position u * k: encoding, one hidden layer of relu."""
+    rows, wts, hidden = room
+    size, width = tables.shape[1], w_in.shape[1]
+    x, y, z = (u[0] * k + 2) / 4, (u[1] * k + 2) / 4, (u[2] * k + 2) / 4
+    for j in range(width):
+        hidden[j] = 0
+    for level in range(tables.shape[0]):
+        _corners(x, y, z, resolutions[level], size, rows, wts)
+        a0 = a1 = np.float32(0)
+        for c in range(8):
+            a0 += wts[c] * tables[level, rows[c], 0]
+            a1 += wts[c] * tables[level, rows[c], 1]
+        for j in range(width):
+            hidden[j] += a0 * w_in[2 * level, j] + a1 * w_in[2 * level + 1, j]
+    raw = np.float32(0)
+    for j in range(width):
+        raw += max(hidden[j], np.float32(0)) * w_out[j]
+    return raw
+
+
 @njit(parallel=True, **_JIT)
-def _march(origins, directions, centre, radius, grid, lattice, jitter, t0, t1, counts):  # type: ignore[no-untyped-def]
-    """Fills row r of t0, t1 (N, K) and counts[r]; counts may exceed K, then the caller retries with a wider K."""
+def _march(rays, space, grid, lattice, net, t0, t1, counts):  # type: ignore[no-untyped-def]
+    """Fills row r of t0, t1 (N, K) and counts[r]; counts may exceed K, then the caller retries with a wider K.
+
+    With a density network in ``net`` a ray ends where its optical depth passes ``stop``.
+    """
+    origins, directions, jitter = rays
+    centre, radius = space
     near, far, step = lattice
+    tables, resolutions, w_in, w_out, stop = net
     r_cells, room = grid.shape[0], t0.shape[1]
     per_unit = np.float32(r_cells / 4)
-    for r in prange(origins.shape[0]):
+    blocks = (origins.shape[0] + 63) // 64
+    for b in prange(blocks):
         u, v = np.empty(3, np.float32), np.empty(3, np.float32)
-        for a in range(3):
-            v[a] = directions[r, a] / radius
-        t = np.float32(near + jitter[r] * step)
-        n = 0
-        while t < far:
-            m = np.float32(0)
+        scratch = (np.empty(8, np.int32), np.empty(8, np.float32), np.empty(max(len(w_out), 1), np.float32))
+        for r in range(b * 64, min(origins.shape[0], (b + 1) * 64)):
             for a in range(3):
-                u[a] = (origins[r, a] - centre[a]) / radius + v[a] * t
-                m = max(m, abs(u[a]))
-            m = max(m, np.float32(1))
-            dt = np.float32(step) * m * math.sqrt(m)
-            m = np.float32(0)
-            for a in range(3):
-                u[a] += v[a] * dt / 2
-                m = max(m, abs(u[a]))
-            k = np.float32(1) if m <= 1 else (2 - 1 / m) / m
-            ix = min(max(int((u[0] * k + 2) * per_unit), 0), r_cells - 1)
-            iy = min(max(int((u[1] * k + 2) * per_unit), 0), r_cells - 1)
-            iz = min(max(int((u[2] * k + 2) * per_unit), 0), r_cells - 1)
-            if grid[ix, iy, iz] > 0:
-                if n < room:
-                    t0[r, n], t1[r, n] = t, t + dt
-                n += 1
-            elif m < 1:
-                # every lattice midpoint strictly inside this empty cell can be skipped; one is kept back for rounding
-                skip = math.floor(_cell_exit(u, v, per_unit, np.float32(step))) - 1
-                if skip > 0:
-                    inside = (1 - m) / (step * max(abs(v[0]), abs(v[1]), abs(v[2])))
-                    t += np.float32(step) * math.floor(min(np.float32(skip), np.float32(max(inside - 1, 0))))
-            t += dt
-        counts[r] = n
+                v[a] = directions[r, a] / radius
+            t = np.float32(near + jitter[r] * step)
+            tau = np.float32(0)
+            n = 0
+            while t < far and tau < stop:
+                m = np.float32(0)
+                for a in range(3):
+                    u[a] = (origins[r, a] - centre[a]) / radius + v[a] * t
+                    m = max(m, abs(u[a]))
+                m = max(m, np.float32(1))
+                dt = np.float32(step) * m * math.sqrt(m)
+                m = np.float32(0)
+                for a in range(3):
+                    u[a] += v[a] * dt / 2
+                    m = max(m, abs(u[a]))
+                k = np.float32(1) if m <= 1 else (2 - 1 / m) / m
+                ix = min(max(int((u[0] * k + 2) * per_unit), 0), r_cells - 1)
+                iy = min(max(int((u[1] * k + 2) * per_unit), 0), r_cells - 1)
+                iz = min(max(int((u[2] * k + 2) * per_unit), 0), r_cells - 1)
+                if grid[ix, iy, iz] > 0:
+                    if n < room:
+                        t0[r, n], t1[r, n] = t, t + dt
+                    n += 1
+                    if len(w_out) > 0:
+                        raw = _optical_density(u, k, tables, resolutions, w_in, w_out, scratch)
+                        tau += math.exp(min(raw, np.float32(15))) / radius * dt
+                elif m < 1:
+                    # all lattice midpoints inside this empty cell can be skipped; one is kept back for rounding
+                    skip = math.floor(_cell_exit(u, v, per_unit, np.float32(step))) - 1
+                    if skip > 0:
+                        inside = (1 - m) / (step * max(abs(v[0]), abs(v[1]), abs(v[2])))
+                        t += np.float32(step) * math.floor(
+                            min(np.float32(skip), np.float32(max(inside - 1, 0)))
+                        )
+                t += dt
+            counts[r] = n
 
 
 @njit(parallel=True, **_JIT)
@@ -343,19 +392,20 @@ def _pack(t0, t1, offsets, out0, out1):  # type: ignore[no-untyped-def]
             out1[offsets[r] + i] = t1[r, i]
 
 
-def march(
-    origins: Tensor, directions: Tensor, space: tuple[Tensor, float], grid: Tensor, lattice: tuple[float, float, float],
-    jitter: Tensor,
+_NO_NET = (np.empty((0, 1, 2), np.float32), np.empty(0, np.int32), np.empty((0, 0), np.float32),
+           np.empty(0, np.float32), np.float32(np.inf))  # fmt: skip
+
+
+def _marched(
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: tuple
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """See `reference.march`."""
-    n, room = len(origins), 128
+    n, room = len(rays[0]), 64
     counts = np.empty(n, np.int64)
+    arrays = tuple(_np(r) for r in rays)
+    place = (_np(space[0].float()), np.float32(space[1]))
     while True:
         t0, t1 = np.empty((n, room), np.float32), np.empty((n, room), np.float32)
-        _march(
-            _np(origins), _np(directions), _np(space[0].float()), np.float32(space[1]), _np(grid), lattice, _np(jitter),
-            t0, t1, counts,
-        )  # fmt: skip
+        _march(arrays, place, _np(grid), lattice, net, t0, t1, counts)
         most = int(counts.max(initial=0))
         if most <= room:
             break
@@ -367,13 +417,31 @@ def march(
     return out0, out1, torch.from_numpy(offsets)
 
 
+def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor, Tensor]:
+    """See `reference.march`."""
+    return _marched(rays, space, grid, lattice, _NO_NET)
+
+
+def march_visible(
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: DensityNet, stop: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `reference.march_visible`."""
+    tables, resolutions, w_in, w_out = net
+    arrays = (_np(tables), np.asarray(resolutions, np.int32), _np(w_in.T), _np(w_out), np.float32(stop))
+    return _marched(rays, space, grid, lattice, arrays)
+
+
 # --- the rest --------------------------------------------------------------------------------------------------------
 
 
 @njit(parallel=True, **_JIT)
 def _contract(x, centre, radius, out):  # type: ignore[no-untyped-def]
     for s in prange(x.shape[0]):
-        a, b, c = (x[s, 0] - centre[0]) / radius, (x[s, 1] - centre[1]) / radius, (x[s, 2] - centre[2]) / radius
+        a, b, c = (
+            (x[s, 0] - centre[0]) / radius,
+            (x[s, 1] - centre[1]) / radius,
+            (x[s, 2] - centre[2]) / radius,
+        )
         m = max(abs(a), max(abs(b), abs(c)))
         k = np.float32(1) if m <= 1 else (2 - 1 / m) / m
         out[s, 0], out[s, 1], out[s, 2] = a * k, b * k, c * k

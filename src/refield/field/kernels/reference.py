@@ -11,6 +11,15 @@ import math
 import torch
 from torch import Tensor
 
+Rays3 = tuple[Tensor, Tensor, Tensor]
+"""origins (N, 3), unit directions (N, 3), jitter (N,) in [0, 1) that shifts each ray's lattice"""
+Space = tuple[Tensor, float]
+"""centre (3,) and radius of the contraction"""
+Lattice = tuple[float, float, float]
+"""near, far, step in world units"""
+DensityNet = tuple[Tensor, tuple[int, ...], Tensor, Tensor]
+"""hash tables (L, T, F), their resolutions, hidden weights (H, L * F), output weights (H,)"""
+
 PRIMES = (1, 2654435761, 805459861)  # the spatial hash of Teschner et al. 2003, as in Instant-NGP, Eq. 4
 
 
@@ -112,16 +121,13 @@ def distortion(w: Tensor, s_starts: Tensor, s_ends: Tensor, offsets: Tensor) -> 
     return each.new_zeros(len(offsets) - 1).index_add(0, _ray_ids(offsets), each)
 
 
-def march(
-    origins: Tensor, directions: Tensor, space: tuple[Tensor, float], grid: Tensor, lattice: tuple[float, float, float],
-    jitter: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
+def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor, Tensor]:
     """Samples where ``grid`` (R, R, R) uint8 over contracted space is set.
 
-    ``space`` is (centre, radius) of the contraction, ``lattice`` is (near, far, step): steps are ``step`` long inside
-    the core cube and times m^1.5 outside, between a pixel's growth (m) and a contracted cell's (m^2); ``jitter`` (N,) in [0, 1) shifts each ray's lattice.
-    Returns t_starts (S,), t_ends (S,), offsets (N + 1,).
+    Steps are ``step`` long inside the core cube and times m^1.5 outside, between a pixel's growth (m) and a
+    contracted cell's (m^2). Returns t_starts (S,), t_ends (S,), offsets (N + 1,).
     """
+    origins, directions, jitter = rays
     centre, radius = space
     near, far, step = lattice
     r = grid.shape[0]
@@ -146,6 +152,25 @@ def march(
     counts = torch.bincount(owner, minlength=len(origins))
     offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
     return torch.cat(starts)[order], torch.cat(ends)[order], offsets
+
+
+def march_visible(
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: DensityNet, stop: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As :func:`march`, but a ray ends after the sample in which its optical depth passes ``stop``.
+
+    The density is that of a hash encoding and one hidden layer of relu, per world unit: exp(raw) / radius.
+    """
+    origins, directions, _ = rays
+    t0, t1, offsets = march(rays, space, grid, lattice)
+    tables, resolutions, w_in, w_out = net
+    ids = _ray_ids(offsets)
+    x = origins[ids] + directions[ids] * ((t0 + t1) / 2)[:, None]
+    features = hash_encode((contract(x, *space) + 2) / 4, tables, resolutions)
+    sigma = torch.exp(((features @ w_in.T).relu() @ w_out).clamp(max=15)) / space[1]
+    keep = _exclusive_sum(sigma * (t1 - t0), offsets) < stop
+    counts = torch.zeros(len(offsets) - 1, dtype=torch.long, device=ids.device).index_add(0, ids, keep.long())
+    return t0[keep], t1[keep], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
 
 
 def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, step: int) -> None:

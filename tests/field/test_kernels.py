@@ -1,0 +1,150 @@
+"""Each fast kernel equals its plain-torch twin: values and gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from refield.field.encoding import geometric_levels
+from refield.field.kernels import cpu, reference
+
+LAYOUTS = [(4,), (16, 37, 512), geometric_levels(16, 1024, 10)]
+
+
+def packed(rays: int = 40) -> Tensor:
+    """Offsets of rays with 0 to 29 samples each."""
+    counts = torch.randint(0, 30, (rays,))
+    counts[3] = 0
+    return torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
+
+
+def segments(offsets: Tensor) -> tuple[Tensor, Tensor]:
+    t0 = torch.rand(int(offsets[-1])).sort().values * 3
+    return t0, t0 + 0.02  # equal lengths, so that the midpoints are in order too
+
+
+@pytest.mark.parametrize("resolutions", LAYOUTS)
+@pytest.mark.parametrize("log2_table", [10, 14])
+def test_hash_encoding(resolutions: tuple[int, ...], log2_table: int) -> None:
+    torch.manual_seed(1)
+    unit = torch.rand(3000, 3)
+    unit[:4] = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1, 0, 0.5], [0.999999, 1, 0]])
+    tables = torch.randn(len(resolutions), 1 << log2_table, 2)
+    upstream = torch.randn(3000, 2 * len(resolutions))
+    results = []
+    for twin in (reference, cpu):
+        u, t = unit.clone().requires_grad_(), tables.clone().requires_grad_()
+        out = twin.hash_encode(u, t, resolutions)
+        results.append((out.detach(), *torch.autograd.grad((out * upstream).sum(), [u, t])))
+    for truth, fast in zip(*results):
+        torch.testing.assert_close(fast, truth, rtol=1e-4, atol=2e-3 * float(truth.abs().mean()))
+
+
+def test_weights_and_closed_form() -> None:
+    torch.manual_seed(2)
+    offsets = packed()
+    t0, t1 = segments(offsets)
+    sigma = torch.rand(len(t0)) * 5
+    upstream = torch.randn(len(t0))
+    grads = []
+    for twin in (reference, cpu):
+        s = sigma.clone().requires_grad_()
+        w = twin.weights(s, t0, t1, offsets)
+        grads.append((w.detach(), torch.autograd.grad((w * upstream).sum(), s)[0]))
+    for truth, fast in zip(*grads):
+        torch.testing.assert_close(fast, truth, rtol=1e-4, atol=1e-5)
+    opacity = cpu.accumulate(grads[1][0], torch.ones(len(t0), 1), offsets)[:, 0]
+    tau = reference.accumulate(sigma * (t1 - t0), torch.ones(len(t0), 1), offsets)[:, 0]
+    torch.testing.assert_close(opacity + torch.exp(-tau), torch.ones(len(opacity)))  # nothing is lost
+
+
+def test_accumulate() -> None:
+    torch.manual_seed(3)
+    offsets = packed()
+    n = int(offsets[-1])
+    w, values, upstream = torch.rand(n), torch.randn(n, 5), torch.randn(len(offsets) - 1, 5)
+    results = []
+    for twin in (reference, cpu):
+        a, b = w.clone().requires_grad_(), values.clone().requires_grad_()
+        out = twin.accumulate(a, b, offsets)
+        results.append((out.detach(), *torch.autograd.grad((out * upstream).sum(), [a, b])))
+    for truth, fast in zip(*results):
+        torch.testing.assert_close(fast, truth, rtol=1e-4, atol=1e-5)
+
+
+def test_distortion_against_the_double_sum() -> None:
+    torch.manual_seed(4)
+    offsets = packed()
+    t0, t1 = segments(offsets)
+    w, upstream = torch.rand(len(t0)) * 0.1, torch.rand(len(offsets) - 1)
+    results = []
+    for twin in (reference, cpu):
+        a = w.clone().requires_grad_()
+        out = twin.distortion(a, t0, t1, offsets)
+        results.append((out.detach(), torch.autograd.grad((out * upstream).sum(), a)[0]))
+    for truth, fast in zip(*results):
+        torch.testing.assert_close(fast, truth, rtol=1e-3, atol=1e-5)
+    own = slice(int(offsets[5]), int(offsets[6]))
+    mid = (t0[own] + t1[own]) / 2
+    ww = w[own, None] * w[None, own]
+    direct = (ww * (mid[:, None] - mid[None]).abs()).sum() + (w[own] ** 2 * (t1 - t0)[own]).sum() / 3
+    torch.testing.assert_close(results[1][0][5], direct, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("fill", [0.0, 0.05, 0.5, 1.0])
+@pytest.mark.parametrize("visible", [False, True])
+def test_march(fill: float, visible: bool) -> None:
+    torch.manual_seed(5)
+    grid = (torch.rand(32, 32, 32) < fill).to(torch.uint8)
+    origins = torch.randn(200, 3) * 2
+    directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
+    directions[0], directions[1] = torch.tensor([1.0, 0, 0]), torch.tensor([0, 0, -1.0])
+    space, lattice = (torch.tensor([0.1, -0.2, 0.3]), 1.5), (0.01, 60.0, 0.02)
+    rays = (origins, directions, torch.rand(200))
+    if visible:
+        net = (torch.randn(3, 1 << 12, 2), (8, 16, 64), torch.randn(32, 6), torch.randn(32) * 0.1)
+        truth, fast = (twin.march_visible(rays, space, grid, lattice, net, 7.0) for twin in (reference, cpu))
+        assert len(truth[0]) < len(reference.march(rays, space, grid, lattice)[0]) or fill == 0
+    else:
+        truth, fast = (twin.march(rays, space, grid, lattice) for twin in (reference, cpu))
+    # a midpoint on a cell's face may fall either way after a long sum of float32 steps
+    difference = (fast[2].diff() - truth[2].diff()).abs()
+    assert difference.max() <= 2
+    assert int(difference.sum()) <= max(2, 0.002 * len(truth[0]))
+    same = difference == 0
+    ids_t, ids_f = (torch.repeat_interleave(same, o.diff()) for o in (truth[2], fast[2]))
+    close = (truth[0][ids_t] - fast[0][ids_f]).abs() < 1e-2 * (1 + truth[0][ids_t].abs())
+    assert close.float().mean() > 0.995 if len(close) else fill == 0.0
+
+
+def test_adam_and_scatter_max() -> None:
+    torch.manual_seed(6)
+    grad = torch.randn(2, 64, 2) * (torch.rand(2, 64, 2) < 0.5)
+    states = []
+    for twin in (reference, cpu):
+        p, m, v = torch.ones(2, 64, 2), torch.zeros(2, 64, 2), torch.zeros(2, 64, 2)
+        for step in (1, 2, 3):
+            twin.adam(p, grad, m, v, 1e-2, step)
+        into = torch.zeros(50)
+        twin.scatter_max(torch.linspace(0, 1, 200), torch.arange(200) * 7 % 50, into)
+        states.append((p, m, v, into))
+    for truth, fast in zip(*states):
+        torch.testing.assert_close(fast, truth)
+
+
+def test_contraction_and_harmonics() -> None:
+    torch.manual_seed(7)
+    x = torch.randn(500, 3) * torch.logspace(-2, 3, 500)[:, None]
+    centre, radius = torch.tensor([0.3, -0.1, 0.2]), 1.7
+    y = cpu.contract(x, centre, radius)
+    torch.testing.assert_close(y, reference.contract(x, centre, radius))
+    assert y.abs().max() < 2
+    near = x.norm(dim=-1) < 100  # further out float32 has no digits left to go back
+    torch.testing.assert_close(reference.uncontract(y, centre, radius)[near], x[near], rtol=1e-2, atol=1e-4)
+    d = torch.nn.functional.normalize(x, dim=-1)
+    sh = cpu.spherical_harmonics(d)
+    torch.testing.assert_close(sh, reference.spherical_harmonics(d), rtol=1e-4, atol=1e-5)
+    ring = torch.nn.functional.normalize(torch.randn(200_000, 3), dim=-1)
+    gram = cpu.spherical_harmonics(ring).T @ cpu.spherical_harmonics(ring) * (4 * torch.pi / len(ring))
+    torch.testing.assert_close(gram, torch.eye(16), rtol=0, atol=0.05)  # orthonormal on the sphere
