@@ -37,6 +37,11 @@ def views(world):
     ]
 
 
+def rays_through(view, pixels):
+    directions = CAMERA.unproject(torch.from_numpy(pixels)) @ view.world_from_cam[:3, :3].T
+    return Rays(view.world_from_cam[:3, 3].expand(len(pixels), 3), directions)
+
+
 def test_the_analytic_field_shows_what_is_there(world, field):
     pose = ring(world.target)[2]
     picture = render_camera(field, CAMERA, pose)
@@ -49,9 +54,7 @@ def test_the_analytic_field_shows_what_is_there(world, field):
 
 def test_its_sampler_misses_nothing(world, field):
     """Every point with density lies in an occupied cell."""
-    x = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(0)) * 2.4 - torch.tensor(
-        [1.2, 1.2, 0.1]
-    )
+    x = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(0)) * 2.4 - torch.tensor([1.2, 1.2, 0.1])
     assert field.sampler.occupied(x)[field.density(x) > 0].all()
 
 
@@ -73,13 +76,7 @@ def test_the_matcher_follows_the_surface(world, views):
     px_a, px_b, score = matcher.match(views[0].image, views[3].image)
     assert len(px_a) == len(px_b) == len(score) > 200
     # rays through matched pixels, carried along with their item, end on the same point of the same item
-    ray = [
-        Rays(
-            v.world_from_cam[:3, 3].expand(len(p), 3),
-            CAMERA.unproject(torch.from_numpy(p)) @ v.world_from_cam[:3, :3].T,
-        )
-        for v, p in ((views[0], px_a), (views[3], px_b))
-    ]
+    ray = [rays_through(views[0], px_a), rays_through(views[3], px_b)]
     hits = [first_hits(v.state, r) for v, r in zip((views[0], views[3]), ray)]
     assert torch.equal(hits[0].item, hits[1].item)
     worlds = [r.origins + h.depth.double()[:, None] * r.directions for h, r in zip(hits, ray)]
@@ -102,7 +99,7 @@ def test_the_segmenter_returns_the_item_in_the_box(world, views):
     boxes = []
     for i in (1, 2, 3):
         rows, columns = np.nonzero(item == i)
-        boxes.append([columns.min() - 1, rows.min(), columns.max() + 2, rows.max() + 1])
+        boxes.append([columns.min() - 0.5, rows.min(), columns.max() + 1, rows.max() + 1.3])
     masks, scores = segmenter.masks(views[0].image, np.array(boxes, float))
     assert all(np.array_equal(masks[k], item == i) for k, i in enumerate((1, 2, 3)))
     assert (scores > 0.8).all() and (scores <= 1).all()

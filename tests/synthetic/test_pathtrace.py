@@ -1,17 +1,20 @@
 """The renderer and the closed forms see the same scene; a written world is complete."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from refield.field.render import render_camera
 from refield.scene.change_files import load_change
 from refield.scene.errors import InputError
 from refield.scene.images import read_image, read_mask
 from refield.scene.transforms_json import load_transforms
 from refield.synthetic import pathtrace
 from refield.synthetic.cameras import ring, square_camera
+from refield.synthetic.oracles import AnalyticField
 from refield.synthetic.visibility import view_hits
 from refield.synthetic.worlds import WORLDS
 from refield.synthetic.write import SynthConfig, write_world
@@ -38,41 +41,45 @@ def test_a_missing_renderer_is_one_clear_line(monkeypatch):
         pathtrace.mitsuba.__wrapped__()
 
 
-def test_the_picture_shows_each_item_where_the_closed_form_has_it(tracer):
-    """Items painted in one glowing colour each, in a dark world: the brightest channel names the item."""
-    from dataclasses import replace
+def evenly_lit(state):
+    """The same solids, matt and under the same light from everywhere."""
+    items = tuple(replace(item, glossy=False) for item in state.items)
+    return replace(state, items=items, surroundings=np.ones((8, 16, 3), np.float32))
 
-    world = WORLDS["removed"](0)
+
+def grown(mask):
+    return torch.nn.functional.max_pool2d(mask[None].float(), 3, 1, 1)[0] > 0
+
+
+def test_the_picture_shows_each_item_where_the_closed_form_has_it(tracer):
+    """One object painted red, one blue, on black: the colour names the item, but for pixels on an edge."""
+    state = evenly_lit(WORLDS["removed"](0).before)
     paints = np.array([[0.02, 0.02, 0.02], [0.9, 0.02, 0.02], [0.02, 0.02, 0.9]], np.float32)
-    items = tuple(
-        replace(i, texture=np.broadcast_to(p, i.texture.shape).copy(), glossy=False)
-        for i, p in zip(world.before.items, paints)
-    )
-    state = replace(world.before, items=items, surroundings=np.ones((8, 16, 3), np.float32))
-    camera, pose = square_camera(48), ring(world.target)[1]
+    painted = [replace(i, texture=np.broadcast_to(p, i.texture.shape).copy()) for i, p in zip(state.items, paints)]
+    state = replace(state, items=tuple(painted))
+    camera, pose = square_camera(48), ring((0, 0, 0.15))[1]
     image = tracer(state).photo(camera, pose, 32, 0)
     assert image.shape == (48, 48, 3) and image.isfinite().all()
     item = view_hits(state, camera, pose).item
     for index, channel in ((1, 0), (2, 2)):
-        red = image[..., channel] > image[..., 2 - channel] + 0.2
-        assert ((red & (item == index)).sum() / (red | (item == index)).sum()) > 0.85
+        seen = image[..., channel] > image[..., 2 - channel] + 0.15
+        there = item == index
+        assert there.sum() > 100
+        assert seen[~grown(~there)].all() and not (seen & ~grown(there)).any()
 
 
 def test_the_texture_is_laid_on_as_the_closed_form_says(tracer):
-    """Against the texture looked up by hand, under even light: brighter is brighter everywhere."""
-    from refield.field.render import render_camera
-    from refield.synthetic.oracles import AnalyticField
-
-    world = WORLDS["cube"](0)
-    camera, pose = square_camera(48), ring(world.target)[2]
-    photo = tracer(world.before).photo(camera, pose, 32, 0)
-    plain = render_camera(AnalyticField(world.before), camera, pose).rgb
-    hits = view_hits(world.before, camera, pose).item
+    """Under even light the photo is the texture, but for some dark near the floor."""
+    state = evenly_lit(WORLDS["cube"](0).before)
+    camera, pose = square_camera(64), ring((0, 0, 0.15))[2]
+    photo = tracer(state).photo(camera, pose, 32, 0)
+    plain = render_camera(AnalyticField(state), camera, pose).rgb
+    item = view_hits(state, camera, pose).item
     for index in (0, 1):
-        shown = hits == index
+        inner = ~grown(item != index)
         for channel in range(3):
-            pair = torch.stack([photo[shown][:, channel], plain[shown][:, channel]])
-            assert torch.corrcoef(pair)[0, 1] > 0.8
+            pair = torch.stack([photo[inner][:, channel], plain[inner][:, channel]])
+            assert torch.corrcoef(pair)[0, 1] > 0.85
 
 
 def test_a_written_world_is_complete_and_consistent(tracer, tmp_path):

@@ -13,14 +13,18 @@ from refield.synthetic.textures import to_linear, to_srgb
 from refield.synthetic.visibility import view_hits
 from refield.synthetic.worlds import FLOOR_HALF, PAPER_MOVE, WORLDS
 
-KINDS = {
-    **dict.fromkeys(["cube", "cylinder", "sphere", "cone"], ["moved"]),
-    **dict.fromkeys(["tipped", "shadow", "plain", "cluttered", "table"], ["moved"]),
+ONE_MOVED = ("cube", "cylinder", "sphere", "cone", "tipped", "shadow", "plain", "cluttered", "table")
+KINDS = {name: ["moved"] for name in ONE_MOVED} | {
     "two_moved": ["moved", "moved"],
     "removed": ["removed"],
     "added": ["added"],
     "nothing": [],
 }
+UP = torch.tensor([0, 0, 1.0], dtype=torch.float64)
+
+
+def uniform(n, seed=0):
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
@@ -35,28 +39,21 @@ def test_every_world_changes_as_its_name_says(worlds):
 def test_the_change_carries_the_old_shape_onto_the_new_one(worlds):
     for world in worlds.values():
         for change in (c for c in world.changes if c.kind == "moved"):
-            x = (
-                torch.rand(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 1.2
-                - 0.6
-            )
+            x = uniform(500) * 1.2 - 0.6
             x = x + change.old.world_from_item[:3, 3]
             assert torch.allclose(
                 change.old.distance(x), change.new.distance(transform(change.new_from_old, x)), atol=1e-9
             )
 
 
-@pytest.mark.parametrize(
-    "name, solid", [("cube", Box), ("cylinder", Cylinder), ("sphere", Sphere), ("cone", Cone)]
-)
+@pytest.mark.parametrize("name, solid", [("cube", Box), ("cylinder", Cylinder), ("sphere", Sphere), ("cone", Cone)])
 def test_the_papers_objects_move_as_in_the_paper(worlds, name, solid):
     (change,) = worlds[name].changes
     assert isinstance(change.old.solid, solid)
     shift = change.new.world_from_item[:3, 3] - change.old.world_from_item[:3, 3]
     assert torch.allclose(shift, torch.tensor(PAPER_MOVE, dtype=torch.float64))
     assert angle_between(change.old.world_from_item, change.new.world_from_item) > 20
-    assert torch.allclose(
-        change.new_from_old[2], torch.tensor([0, 0, 1.0, 0], dtype=torch.float64), atol=1e-12
-    )
+    assert torch.allclose(change.new_from_old[2], torch.tensor([0, 0, 1.0, 0], dtype=torch.float64), atol=1e-12)
 
 
 def test_objects_stand_on_the_floor_apart_from_each_other(worlds):
@@ -76,7 +73,7 @@ def test_objects_stand_on_the_floor_apart_from_each_other(worlds):
 
 def test_the_tipped_box_lies_on_another_face(worlds):
     (change,) = worlds["tipped"].changes
-    up = change.new_from_old[:3, :3] @ torch.tensor([0, 0, 1.0], dtype=torch.float64)
+    up = change.new_from_old[:3, :3] @ UP
     assert abs(float(up[2])) < 1e-9
 
 
@@ -97,22 +94,15 @@ def test_textures_let_a_turn_be_seen(worlds):
         item = worlds[name].changes[0].old
         if isinstance(item.solid, Box):
             h, w = item.texture.shape[0] // 2, item.texture.shape[1] // 3
-            faces = [
-                item.texture[r * h : (r + 1) * h, c * w : (c + 1) * w] for r in range(2) for c in range(3)
-            ]
+            faces = [item.texture[r * h : (r + 1) * h, c * w : (c + 1) * w] for r in range(2) for c in range(3)]
             apart = [
-                np.abs(a - np.rot90(b, k)).mean()
-                for i, a in enumerate(faces)
-                for b in faces[:i]
-                for k in range(4)
+                np.abs(a - np.rot90(b, k)).mean() for i, a in enumerate(faces) for b in faces[:i] for k in range(4)
             ]
             assert min(apart) > 0.1
         else:
             height, width = item.texture.shape[:2]
             side = item.texture[: height // 2]
-            apart = [
-                np.abs(side - np.roll(side, s, 1)).mean() for s in range(width // 12, width, width // 12)
-            ]
+            apart = [np.abs(side - np.roll(side, s, 1)).mean() for s in range(width // 12, width, width // 12)]
             assert min(apart) > 0.08
 
 

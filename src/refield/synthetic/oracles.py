@@ -32,9 +32,7 @@ class AnalyticField:
     looks the same wherever it is, which makes the commuting square (DESIGN §7) exact.
     """
 
-    def __init__(
-        self, state: State, *, depth: float = 0.01, sigma: float = 600.0, resolution: int = 192
-    ) -> None:
+    def __init__(self, state: State, *, depth: float = 0.01, sigma: float = 600.0, resolution: int = 192) -> None:
         """``depth`` in metres, ``sigma`` per metre; ``resolution`` of the sampler's grid, a side."""
         self._items, self._depth, self._sigma = state.items, depth, sigma
         self._poses = [invert(item.world_from_item) for item in state.items]
@@ -54,7 +52,7 @@ class AnalyticField:
         return self._density(self._distances(x).amin(0))
 
     def __call__(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """World points (..., 3) and unit directions (..., 3) -> sigma (...,) and rgb (..., 3), sRGB in [0, 1]."""
+        """World points (..., 3), unit directions (..., 3) -> sigma (...,), rgb (..., 3) sRGB in [0, 1]."""
         nearest, owner = self._distances(x).min(0)
         rgb = torch.zeros_like(x)
         for i, item in enumerate(self._items):
@@ -87,7 +85,7 @@ def _looked_up(texture: Tensor, uv: Tensor) -> Tensor:
     """Bilinear, texel centres at (i + 0.5) / size. texture (1, 3, H, W), uv (K, 2) -> (K, 3)."""
     grid = (uv * 2 - 1)[None, None].to(texture.dtype)
     found = functional.grid_sample(texture, grid, mode="bilinear", padding_mode="border", align_corners=False)
-    return found[0, :, 0].T
+    return found[0, :, 0].T.to(uv.dtype)
 
 
 @dataclass(frozen=True)
@@ -140,15 +138,13 @@ class OracleSegmenter:
     def masks(
         self, image: NDArray[np.uint8], boxes: NDArray[np.float64], hint: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Boxes (B, 4) px xyxy -> the item whose own box fits best, (B, H, W) bool, and how well (IoU), (B,)."""
+        """Boxes (B, 4) px xyxy -> the item whose box fits best, (B, H, W) bool, and how well (IoU), (B,)."""
         item = self._album[image].hits.item
         shown = [item == i for i in torch.unique(item).tolist() if i > 0]
         blank = torch.zeros_like(item, dtype=torch.bool)
         masks, scores = [], []
         for box in np.asarray(boxes, np.float64).reshape(-1, 4):
-            score, mask = max(
-                ((_box_iou(_box(m), box), m) for m in shown), key=lambda p: p[0], default=(0.0, blank)
-            )
+            score, mask = max(((_box_iou(_box(m), box), m) for m in shown), key=lambda p: p[0], default=(0.0, blank))
             masks.append(mask.numpy() if score > 0 else blank.numpy())
             scores.append(score)
         return np.array(masks, bool).reshape(-1, *item.shape), np.array(scores)
@@ -167,9 +163,7 @@ def _box_iou(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 class OracleMatcher:
     """A Matcher that follows surface points from one state and view to the other."""
 
-    def __init__(
-        self, views: Iterable[KnownView], *, every: int = 2, noise: float = 0.0, seed: int = 0
-    ) -> None:
+    def __init__(self, views: Iterable[KnownView], *, every: int = 2, noise: float = 0.0, seed: int = 0) -> None:
         """Every so-many-th pixel of image_a is a keypoint; ``noise`` in pixels is added to image_b's side."""
         self._album, self._every, self._noise = _Album(views), every, noise
         self._rng = np.random.default_rng(seed)
@@ -184,9 +178,7 @@ class OracleMatcher:
             there = b.state.named(item.name)
             if there is not None:
                 pixels, world = self._surface(a, i)
-                seen, at = _seen(
-                    b, there, transform(there.world_from_item @ invert(item.world_from_item), world)
-                )
+                seen, at = _seen(b, there, transform(there.world_from_item @ invert(item.world_from_item), world))
                 px_a.append(pixels[seen].numpy())
                 px_b.append(at[seen].numpy())
         found = np.concatenate(px_b)

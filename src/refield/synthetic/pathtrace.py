@@ -25,9 +25,7 @@ _PROBE = "import drjit; print(drjit.detail.llvm_version()[0])"
 def variant() -> str:
     """``llvm_ad_rgb`` where a usable LLVM is found by asking in another process, else ``scalar_rgb``."""
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=120, check=True
-        )
+        done = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=120, check=True)
         return "llvm_ad_rgb" if int(done.stdout) >= _OLDEST_LLVM else "scalar_rgb"
     except (subprocess.SubprocessError, OSError, ValueError):
         return "scalar_rgb"
@@ -43,9 +41,7 @@ def mitsuba() -> Any:
     try:
         import mitsuba as mi
     except ImportError:
-        raise InputError(
-            "synth", "the renderer Mitsuba 3 is not installed", "pip install 'refield[synth]'"
-        ) from None
+        raise InputError("synth", "the renderer Mitsuba 3 is not installed", "pip install 'refield[synth]'") from None
     mi.set_variant(variant())
     mi.set_log_level(mi.LogLevel.Error)
     return mi

@@ -1,6 +1,7 @@
-"""Solids in closed form: distance, ray hit, texture coordinates and a mesh. Object axes, origin at the middle.
+"""Solids in closed form: distance, ray hit, texture coordinates and a mesh.
 
-One texture atlas wraps each solid; coordinates (u, v) are in [0, 1], v down the image's rows.
+Everything is in the object's axes, origin at its middle. One texture atlas wraps each solid;
+coordinates (u, v) are in [0, 1], v down the image's rows.
 """
 
 from __future__ import annotations
@@ -71,7 +72,8 @@ class Box:
 
     def mesh(self) -> Mesh:
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
-        vertices, faces = [], []
+        vertices: list[NDArray[np.float64]] = []
+        faces: list[list[int]] = []
         for axis in range(3):
             for sign in (-1, 1):
                 face = np.zeros((4, 3))
@@ -173,7 +175,7 @@ class Cone:
         return (self.radius, self.radius, self.height / 2)
 
     def _side(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Along the slope from the rim (0) to the point (1), and height above it, in the (r, z) half-plane."""
+        """Along the slope from the rim (0) to the point (1), and above it, in the (r, z) half-plane."""
         r, z = x[..., :2].norm(dim=-1), x[..., 2] + self.height / 2
         slope = (self.radius**2 + self.height**2) ** 0.5
         along = ((self.radius - r) * self.radius + z * self.height) / slope**2

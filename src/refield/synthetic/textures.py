@@ -1,6 +1,7 @@
 """Real-looking textures made from numbers: floors, painted boxes, patchwork, surroundings. sRGB in [0, 1].
 
-Everything is band-limited: the finest detail is about a fiftieth of a face, so that photos of 128 pixels can hold it.
+Everything is band-limited: the finest detail is about a fiftieth of a face, so that photos of 128 pixels can
+hold it.
 """
 
 from __future__ import annotations
@@ -16,10 +17,8 @@ Image = NDArray[np.float32]
 _SHIFT = 4  # cv2 draws with 4 fractional bits
 
 
-def noise(
-    rng: np.random.Generator, shape: tuple[int, int], cells: tuple[int, int], octaves: int = 3
-) -> Image:
-    """Smooth noise (H, W) around 0, within about ±1, periodic in both directions; ``cells`` is its coarsest grid."""
+def noise(rng: np.random.Generator, shape: tuple[int, int], cells: tuple[int, int], octaves: int = 3) -> Image:
+    """Smooth noise (H, W) around 0, about ±1, periodic in both directions; ``cells`` is its coarsest grid."""
     out = np.zeros(shape, np.float32)
     for k in range(octaves):
         grid = rng.uniform(-1, 1, (cells[0] << k, cells[1] << k)).astype(np.float32)
@@ -95,9 +94,7 @@ def painted_face(rng: np.random.Generator, size: int, hue: float, label: str) ->
     ground = colour(hue, 0.62, 0.62) * (1 + 0.22 * noise(rng, (n, n), (4, 4), 2)[..., None])
     canvas = np.rint(np.clip(ground, 0, 1) * 255).astype(np.uint8)
     for k in range(7):
-        paint = colour(
-            hue + rng.choice([0.12, 0.33, 0.5, 0.67]), rng.uniform(0.2, 0.8), rng.uniform(0.2, 0.95)
-        )
+        paint = colour(hue + rng.choice([0.12, 0.33, 0.5, 0.67]), rng.uniform(0.2, 0.8), rng.uniform(0.2, 0.95))
         at, reach = rng.uniform(0.1, 0.9, 2) * n, rng.uniform(0.07, 0.17) * n
         _patch(canvas, rng, k, _ink(paint), at, reach)
     paint = colour(hue + 0.5, 0.2, 0.97) if rng.random() < 0.5 else colour(hue, 0.5, 0.1)
@@ -154,7 +151,6 @@ def painted_box(rng: np.random.Generator, size: int, hue: float, labels: str = "
 
 def slab(top: Image) -> Image:
     """Atlas of a flat `Box`: the top, and plain sides and bottom."""
-    size = top.shape[0]
     side = np.broadcast_to(top.mean((0, 1)) * 0.8, top.shape)
     stripe = np.concatenate([side, side, side], 1)
     lower = np.concatenate([side, side, top], 1)
@@ -168,9 +164,7 @@ def patchwork(points: NDArray[np.float32], rng: np.random.Generator, cells: int,
     """
     flat = points.reshape(-1, 3)
     seeds = flat[rng.choice(len(flat), cells, replace=False)]
-    paints = np.array(
-        [colour(hue + rng.choice([0, 0.08, 0.35, 0.55]), *rng.uniform(0.25, 0.9, 2)) for _ in seeds]
-    )
+    paints = np.array([colour(hue + rng.choice([0, 0.08, 0.35, 0.55]), *rng.uniform(0.25, 0.9, 2)) for _ in seeds])
     distance = np.linalg.norm(flat[:, None] - seeds[None], axis=-1)
     spread = 0.06 * float(np.median(np.sort(distance, 1)[:, 1]))
     weight = np.exp(-(distance - distance.min(1, keepdims=True)) / spread)
@@ -181,7 +175,7 @@ def patchwork(points: NDArray[np.float32], rng: np.random.Generator, cells: int,
 
 
 def surroundings(rng: np.random.Generator, sun: float, height: int = 256) -> Image:
-    """Linear radiance (H, 2H, 3), latitude-longitude, z up: sky, a soft sun of strength ``sun``, hedges, ground."""
+    """Linear radiance (H, 2H, 3), latitude-longitude, z up: sky, a soft sun, hedges, ground."""
     shape = (height, 2 * height)
     elevation = (0.5 - (np.arange(height) + 0.5) / height)[:, None] * np.pi
     azimuth = ((np.arange(2 * height) + 0.5) / (2 * height))[None] * 2 * np.pi

@@ -1,6 +1,7 @@
 """Worlds we know exactly: the paper's scenes (§11.1) and harder ones, before and after.
 
-World axes: z up, the floor at z = 0, metres. A world is two `State`s; what differs between them is the change.
+World axes: z up, the floor at z = 0, metres. A world is two `State`s; what differs between them is the
+change.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from refield.scene.change import Kind, OccupancyGrid
 from refield.scene.pose import exp, invert, rigid, transform
 from refield.synthetic import textures
 from refield.synthetic.shapes import Box, Cone, Cylinder, Solid, Sphere
+
+Triple = tuple[float, float, float]
 
 PAPER_MOVE = (0.227, 0.227, 0.0)
 """§11.1, metres"""
@@ -39,7 +42,7 @@ class Item:
     """(4, 4) float64"""
     glossy: bool = False
 
-    def turned(self, degrees: float, shift: tuple[float, float, float]) -> Item:
+    def turned(self, degrees: float, shift: Triple) -> Item:
         """Turned about the upright through its own middle, then shifted."""
         turn = exp(torch.tensor([0, 0, 0, 0, 0, np.deg2rad(degrees)], dtype=torch.float64))[:3, :3]
         here = self.world_from_item
@@ -75,9 +78,9 @@ class State:
     items: tuple[Item, ...]
     surroundings: NDArray[np.float32]
     """(H, 2H, 3) linear radiance, latitude-longitude, z up"""
-    sun: tuple[float, float, float] | None = None
+    sun: Triple | None = None
     """Irradiance of a hard light, linear RGB; None = the surroundings alone"""
-    sun_direction: tuple[float, float, float] = (-0.45, 0.35, -0.82)
+    sun_direction: Triple = (-0.45, 0.35, -0.82)
     """The way the hard light travels"""
 
     def named(self, name: str) -> Item | None:
@@ -106,7 +109,7 @@ class World:
     name: str
     before: State
     after: State
-    target: tuple[float, float, float] = (0.0, 0.0, 0.15)
+    target: Triple = (0.0, 0.0, 0.15)
     """What the cameras look at"""
 
     @property
@@ -147,9 +150,9 @@ def floor(rng: np.random.Generator, paving: Paving = "bricks") -> Item:
 def box_item(
     rng: np.random.Generator,
     name: str,
-    half: tuple[float, float, float],
+    half: Triple,
     hue: float,
-    at: tuple[float, float, float],
+    at: Triple,
 ) -> Item:
     """A painted box standing at (x, y), turned by the third number in degrees."""
     solid = Box(half)
@@ -161,7 +164,7 @@ def round_item(
     name: str,
     solid: Sphere | Cylinder | Cone,
     hue: float,
-    at: tuple[float, float, float],
+    at: Triple,
 ) -> Item:
     """A patchwork solid standing at (x, y), turned by the third number in degrees."""
     return Item(name, solid, wrapped(rng, solid, hue), standing(solid, *at), glossy=True)
@@ -185,7 +188,7 @@ def _state(
     rng: np.random.Generator,
     items: tuple[Item, ...],
     paving: Paving = "bricks",
-    sun: tuple[float, float, float] | None = None,
+    sun: Triple | None = None,
 ) -> State:
     """A state on a floor; with a hard sun the surroundings have no soft one."""
     ground = floor(rng, paving)
@@ -198,7 +201,7 @@ def _moved(name: str, before: State, item: str, after: Item) -> World:
     return World(name, before, replace(before, items=items))
 
 
-_CUBE: tuple[float, float, float] = (0.2, 0.2, 0.2)
+_CUBE: Triple = (0.2, 0.2, 0.2)
 _PLACE = (-0.1, -0.1, 20.0)  # so that old and new place lie evenly about the middle
 
 
@@ -317,7 +320,8 @@ def nothing(seed: int = 0) -> World:
 WORLDS: dict[str, Callable[[int], World]] = {
     f.__name__: f
     for f in (
-        cube, cylinder, sphere, cone, two_moved, removed, added, tipped, shadow, plain, cluttered, table, nothing
+        cube, cylinder, sphere, cone, two_moved, removed, added, tipped, shadow, plain, cluttered, table,
+        nothing,
     )
 }  # fmt: skip
 """Name → builder of a world from a seed."""
