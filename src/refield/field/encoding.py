@@ -36,9 +36,7 @@ class Contraction:
 class HashGrid(nn.Module):
     """Multi-resolution hash encoding of the contracted cube (Instant-NGP), two features a level."""
 
-    def __init__(
-        self, resolutions: tuple[int, ...], table_size: int, generator: torch.Generator | None = None
-    ) -> None:
+    def __init__(self, resolutions: tuple[int, ...], table_size: int, generator: torch.Generator | None = None) -> None:
         super().__init__()
         self.resolutions = resolutions
         self.width = 2 * len(resolutions)

@@ -38,7 +38,7 @@ class FitConfig:
     """Adam's learning rate, held for the first half, then brought down to a thirtieth"""
     distortion: float = 1e-2
     """weight of the distortion loss; without it fog fills the grid"""
-    gradient_unit: float = 0.25
+    gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera (§10.1)"""
     field: HashFieldConfig = field(default_factory=HashFieldConfig)
     """shape of the field"""
@@ -90,11 +90,9 @@ def fit_field(
     shape = config.field
     if config.finest_auto:
         shape = replace(shape, finest=_finest_for(capture.train, contraction))
-    step = contraction.radius * 4 / (shape.finest * 0.75)
+    step = 2 * contraction.radius * 4 / shape.finest  # about two pixels
     grid = torch.ones(128, 128, 128, dtype=torch.uint8)
-    model = HashField(
-        shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), config.seed
-    )
+    model = HashField(shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), config.seed)
     _Fit(model, capture, config, on_progress).run()
     return model.eval().requires_grad_(False)
 
@@ -112,19 +110,15 @@ def place_contraction(capture: Capture) -> Contraction:
     spread = (centres - centres.mean(0)).norm(dim=-1).mean().clamp_min(1e-6)
     guess = (centres + axes * spread).mean(0)
     hold = 1e-3 * len(centres)
-    centre = torch.linalg.solve(
-        across.sum(0) + hold * eye, (across @ centres[:, :, None]).sum(0)[:, 0] + hold * guess
-    )
+    centre = torch.linalg.solve(across.sum(0) + hold * eye, (across @ centres[:, :, None]).sum(0)[:, 0] + hold * guess)
     distance = (centres - centre).norm(dim=-1).median()
     return Contraction(centre.float(), float(distance) * 0.6)
 
 
 def _finest_for(frames: tuple[Frame, ...], contraction: Contraction) -> int:
-    """Cells a side so that the finest is about 1.5 pixels wide where the axes meet; within [256, 4096]."""
-    pixel = min(
-        float((f.centre.float() - contraction.centre).norm()) / max(f.camera.fx, f.camera.fy) for f in frames
-    )
-    wanted = 4 * contraction.radius / (1.5 * pixel)
+    """Cells a side so that the finest is about a pixel wide where the axes meet; within [256, 4096]."""
+    pixel = min(float((f.centre.float() - contraction.centre).norm()) / max(f.camera.fx, f.camera.fy) for f in frames)
+    wanted = 4 * contraction.radius / pixel
     return int(min(max(wanted, 256), 4096))
 
 

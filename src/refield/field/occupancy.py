@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from refield.field import kernels
 from refield.field.pixels import PixelBank
@@ -14,10 +13,9 @@ from refield.field.volrend import weights
 
 _EVERY = 16  # steps between updates
 _OPACITY = 5e-2  # a cell is kept if a sample in it would be more opaque than this
-_WEIGHT = (
-    5e-3  # and if some ray gives it at least this much of its colour: hidden cells cost half of all samples
-)
+_WEIGHT = 5e-3  # and if some ray gives it at least this much of its colour: hidden cells cost half of all samples
 _DECAY = 0.8
+_BACKGROUND = 5.0  # core radii; a cell that no ray ever crossed is taken for empty, unless it is further out
 
 
 class OccupancyTrainer:
@@ -34,6 +32,8 @@ class OccupancyTrainer:
         self.weight = torch.full((cells,), 16 * _WEIGHT)  # the benefit of the doubt
         self.recent_weight = torch.full((cells,), -1.0)  # since the last update; -1: no sample fell here
         self.recent_sigma = torch.zeros(cells)
+        distance = torch.cat([model.sampler.distance(c) for c in torch.arange(cells).split(1 << 20)])
+        self.visited = distance > _BACKGROUND
         self.lengths = torch.cat([model.sampler.step_at(c) for c in torch.arange(cells).split(1 << 20)])
 
     def observe(self, step: int, x: Tensor, w: Tensor, sigmas: Tensor) -> None:
@@ -46,6 +46,7 @@ class OccupancyTrainer:
 
     def _update(self, step: int) -> None:
         seen = self.recent_weight >= 0
+        self.visited |= seen
         opacity = -torch.expm1(-self.recent_sigma * self.lengths)
         self.opacity = torch.where(seen, torch.maximum(self.opacity * _DECAY, opacity), self.opacity)
         self.weight = torch.where(seen, torch.maximum(self.weight * _DECAY, self.recent_weight), self.weight)
@@ -59,6 +60,8 @@ class OccupancyTrainer:
             again = torch.rand(len(self.weight)) < 0.01
             self.weight[again] = self.weight[again].clamp_min(4 * _WEIGHT)
             keep &= self.weight > _WEIGHT
+        if step >= 4 * self.cull_from:
+            keep &= self.visited
         self._set(keep)
 
     def _cells_to_probe(self, step: int) -> Tensor:
@@ -73,8 +76,11 @@ class OccupancyTrainer:
     def _set(self, keep: Tensor) -> None:
         self.model.looking_where(keep.to(torch.uint8).reshape(self.model.sampler.grid.shape))
 
-    def settle(self, pixels: PixelBank, rays: int = 100_000) -> None:
-        """The final grid: every opaque cell that some training ray sees. Leaves the model in training mode."""
+    def settle(self, pixels: PixelBank, rays: int = 200_000) -> None:
+        """The final grid: every opaque cell that some training ray sees. Leaves the model in training mode.
+
+        Where no ray ever went the density is whatever the networks make of it: haze before a new camera.
+        """
         everything = torch.arange(len(self.opacity))
         opaque = self.opacity > _OPACITY / 4
         for _ in range(2):
@@ -89,10 +95,6 @@ class OccupancyTrainer:
                 r = pixels.rays(part)
                 samples = self.model.samples(r, jitter=True)
                 x, _ = samples.positions(r)
-                kernels.scatter_max(
-                    weights(self.model.density(x), samples), self.model.sampler.cells(x), seen
-                )
-        # neighbours of what is seen stay too: a pinhole shows more than a few samples cost
-        shown = (torch.maximum(seen, self.weight) > _WEIGHT).reshape(1, 1, *self.model.sampler.grid.shape)
-        near = functional.max_pool3d(shown.float(), 3, stride=1, padding=1).reshape(-1) > 0
-        self._set(keep & near)
+                kernels.scatter_max(weights(self.model.density(x), samples), self.model.sampler.cells(x), seen)
+        seen = torch.maximum(seen, torch.where(self.visited, self.weight, 0))
+        self._set(keep & (seen > _WEIGHT / 2))

@@ -62,9 +62,12 @@ class OccupancySampler:
 
     def step_at(self, cells: Tensor) -> Tensor:
         """Length of a sample in the given cells (K,), world units (K,)."""
-        m = (self._contracted(cells, None)).abs().amax(-1)
-        outside = torch.where(m > 1, 1 / (2 - m).clamp_min(1e-3), torch.ones_like(m))
-        return self.step * outside**1.5
+        return self.step * self.distance(cells).clamp_min(1.0) ** 1.5
+
+    def distance(self, cells: Tensor) -> Tensor:
+        """L-infinity distance of the given cells' centres from the core's, in core radii, (K,) -> (K,)."""
+        m = self._contracted(cells, None).abs().amax(-1)
+        return torch.where(m > 1, 1 / (2 - m).clamp_min(1e-3), m)
 
     def points_in(self, cells: Tensor, jitter: bool = True) -> Tensor:
         """A world point in each cell: random, or its centre. (K,) -> (K, 3)."""
@@ -93,9 +96,7 @@ class OccupancySampler:
             grid.view(-1)[cells] = self._probe(density, cells, threshold, probes)
         return replace(self, grid=grid)
 
-    def _probe(
-        self, density: Callable[[Tensor], Tensor], cells: Tensor, threshold: float, probes: int
-    ) -> Tensor:
+    def _probe(self, density: Callable[[Tensor], Tensor], cells: Tensor, threshold: float, probes: int) -> Tensor:
         found = torch.zeros(len(cells), dtype=torch.bool, device=cells.device)
         length = self.step_at(cells)
         with torch.no_grad():

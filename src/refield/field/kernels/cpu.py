@@ -20,9 +20,7 @@ from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 
 _JIT = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "cache": True, "nogil": True}
 _P1, _P2 = np.uint32(reference.PRIMES[1]), np.uint32(reference.PRIMES[2])
-_BLOCK = (
-    1024  # samples a thread takes at a time: their coordinates stay in L1 while a level's table stays in L2
-)
+_BLOCK = 1024  # samples a thread takes at a time: their coordinates stay in L1 while a level's table stays in L2
 
 
 def _np(t: Tensor) -> np.ndarray:
@@ -114,16 +112,13 @@ def _encode_slope(unit, tables, resolutions, grad, out):  # type: ignore[no-unty
             fz = unit[s, 2] * res - min(max(int(unit[s, 2] * res), 0), res - 1)
             gx, gy, gz = 1 - fx, 1 - fy, 1 - fz
             sx += res * (
-                gy * (gz * (v[4] - v[0]) + fz * (v[5] - v[1]))
-                + fy * (gz * (v[6] - v[2]) + fz * (v[7] - v[3]))
+                gy * (gz * (v[4] - v[0]) + fz * (v[5] - v[1])) + fy * (gz * (v[6] - v[2]) + fz * (v[7] - v[3]))
             )
             sy += res * (
-                gx * (gz * (v[2] - v[0]) + fz * (v[3] - v[1]))
-                + fx * (gz * (v[6] - v[4]) + fz * (v[7] - v[5]))
+                gx * (gz * (v[2] - v[0]) + fz * (v[3] - v[1])) + fx * (gz * (v[6] - v[4]) + fz * (v[7] - v[5]))
             )
             sz += res * (
-                gx * (gy * (v[1] - v[0]) + fy * (v[3] - v[2]))
-                + fx * (gy * (v[5] - v[4]) + fy * (v[7] - v[6]))
+                gx * (gy * (v[1] - v[0]) + fy * (v[3] - v[2])) + fx * (gy * (v[5] - v[4]) + fy * (v[7] - v[6]))
             )
         out[s, 0], out[s, 1], out[s, 2] = sx, sy, sz
 
@@ -377,9 +372,7 @@ def _march(rays, space, grid, lattice, net, t0, t1, counts):  # type: ignore[no-
                     skip = math.floor(_cell_exit(u, v, per_unit, np.float32(step))) - 1
                     if skip > 0:
                         inside = (1 - m) / (step * max(abs(v[0]), abs(v[1]), abs(v[2])))
-                        t += np.float32(step) * math.floor(
-                            min(np.float32(skip), np.float32(max(inside - 1, 0)))
-                        )
+                        t += np.float32(step) * math.floor(min(np.float32(skip), np.float32(max(inside - 1, 0))))
                 t += dt
             counts[r] = n
 
@@ -396,9 +389,7 @@ _NO_NET = (np.empty((0, 1, 2), np.float32), np.empty(0, np.int32), np.empty((0, 
            np.empty(0, np.float32), np.float32(np.inf))  # fmt: skip
 
 
-def _marched(
-    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: tuple
-) -> tuple[Tensor, Tensor, Tensor]:
+def _marched(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: tuple) -> tuple[Tensor, Tensor, Tensor]:
     n, room = len(rays[0]), 64
     counts = np.empty(n, np.int64)
     arrays = tuple(_np(r) for r in rays)

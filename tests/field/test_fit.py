@@ -1,0 +1,134 @@
+"""The training loop on a little scene in closed form, and the default field's files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from refield.field.fit import FitConfig, FitProgress, fit_field, place_contraction, rate_factor
+from refield.field.radiance import HashField, HashFieldConfig
+from refield.field.render import render_frame
+from refield.scene.camera import Camera
+from refield.scene.capture import Capture, Frame, camera_rays
+from refield.scene.errors import InputError
+from refield.scene.images import frame_image
+from refield.scene.pose import rigid
+
+CAMERA = Camera(32, 32, 34.0, 34.0, 16.0, 16.0)
+TINY = FitConfig(
+    steps=160,
+    samples=4096,
+    check_every=80,
+    field=HashFieldConfig(levels=6, finest=64, log2_table=12),
+    finest_auto=False,
+)
+
+
+def looking_at(centre: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    forward = torch.nn.functional.normalize(target - centre, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0, 1]).double()), dim=0)
+    return rigid(torch.stack([right, torch.linalg.cross(forward, right), forward], 1), centre)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """A coloured ball in front of a striped, far wall, in 20 views."""
+    folder = tmp_path_factory.mktemp("ball")
+    frames = []
+    for i in range(20):
+        a = torch.tensor(i * 0.8, dtype=torch.float64)
+        centre = torch.stack([2 * a.cos(), 2 * a.sin(), 0.3 + 0.08 * torch.tensor(float(i)).double()])
+        pose = looking_at(centre, torch.zeros(3, dtype=torch.float64))
+        rays = camera_rays(CAMERA, pose)
+        b = (rays.origins * rays.directions).sum(-1)
+        inside = b * b - (rays.origins.square().sum(-1) - 0.5**2)
+        hit = rays.origins + rays.directions * (-b - inside.clamp_min(0).sqrt())[:, None]
+        ball = hit + 0.5
+        wall = (torch.sin(4 * rays.directions) * 0.25 + 0.5).abs()
+        rgb = torch.where((inside > 0)[:, None], ball, wall).reshape(32, 32, 3).clamp(0, 1)
+        path = folder / f"{i:02d}.png"
+        Image.fromarray((rgb * 255).round().numpy().astype(np.uint8)).save(path)
+        frames.append(Frame(path, CAMERA, path.name, pose))
+    return Capture(tuple(frames))
+
+
+@pytest.fixture(scope="module")
+def fitted(capture: Capture) -> tuple[HashField, list[FitProgress]]:
+    looks: list[FitProgress] = []
+    return fit_field(capture, TINY, looks.append), looks
+
+
+def test_held_out_views_are_explained(capture: Capture, fitted: tuple[HashField, list[FitProgress]]) -> None:
+    field, looks = fitted
+    truth = torch.stack([frame_image(f) for f in capture.held_out]).float() / 255
+    blank = -10 * float((truth - truth.mean((0, 1, 2))).square().mean().log10())
+    assert looks[-1].psnr > blank + 4
+    assert len(looks) >= 2 and looks[-1].rays_per_second > 0
+    view = render_frame(field, capture.held_out[0])
+    middle = float(view.depth[14:18, 14:18].median())
+    distance = float(capture.held_out[0].centre.norm())
+    assert abs(middle - (distance - 0.5)) < 0.25
+    assert view.opacity.mean() > 0.9
+
+
+def test_same_seed_same_field(capture: Capture) -> None:
+    short = replace(TINY, steps=24)
+    a, b = fit_field(capture, short), fit_field(capture, short)
+    for x, y in zip(a.state_dict().values(), b.state_dict().values()):
+        assert torch.equal(x, y)
+    assert torch.equal(a.sampler.grid, b.sampler.grid)
+
+
+def test_field_survives_its_files(fitted: tuple[HashField, list[FitProgress]], tmp_path: Path) -> None:
+    field, _ = fitted
+    field.save(tmp_path)
+    again = HashField.load(tmp_path)
+    x, d = torch.randn(1000, 3), torch.nn.functional.normalize(torch.randn(1000, 3), dim=-1)
+    for a, b in zip(field(x, d), again(x, d)):
+        assert torch.equal(a, b)
+    assert torch.equal(field.density(x), field(x, d)[0])
+    (tmp_path / "field.json").write_text("{}")
+    with pytest.raises(InputError, match="holds no readable field"):
+        HashField.load(tmp_path)
+
+
+def test_density_is_zero_where_the_sampler_does_not_look(fitted: tuple[HashField, list[FitProgress]]) -> None:
+    field, _ = fitted
+    x = torch.randn(5000, 3) * 2
+    dark = ~field.sampler.occupied(x)
+    assert dark.any() and field.density(x)[dark].abs().max() == 0
+
+
+def test_gradients_reach_positions_and_directions(fitted: tuple[HashField, list[FitProgress]]) -> None:
+    """Of a smooth sum over the field, against central differences."""
+    field, _ = fitted
+    torch.manual_seed(0)
+    x = (torch.randn(400, 3) * 0.6).requires_grad_()
+    d = torch.nn.functional.normalize(torch.randn(400, 3), dim=-1).requires_grad_()
+    keep = field.sampler.occupied(x.detach())
+    out = field(x, d)[1][keep].sum()
+    to_x, to_d = torch.autograd.grad(out, [x, d])
+    h = 1e-3
+    direction = torch.randn(400, 3)
+    with torch.no_grad():
+        up, down = field(x + h * direction, d)[1][keep].sum(), field(x - h * direction, d)[1][keep].sum()
+        assert abs(float((to_x * direction).sum() - (up - down) / (2 * h))) < 0.1 * float(to_x.abs().sum())
+        up, down = field(x, d + h * direction)[1][keep].sum(), field(x, d - h * direction)[1][keep].sum()
+    torch.testing.assert_close((to_d * direction).sum(), (up - down) / (2 * h), rtol=0.05, atol=0.05)
+
+
+def test_core_cube_lies_around_what_the_cameras_look_at(capture: Capture) -> None:
+    space = place_contraction(capture)
+    assert space.centre.norm() < 0.1
+    assert 0.9 < space.radius < 1.8
+
+
+def test_learning_rate_is_held_then_falls() -> None:
+    assert rate_factor(0.0) == rate_factor(0.5) == 1
+    assert 0.03 < rate_factor(1.0) < 0.04
+    assert rate_factor(0.9) < rate_factor(0.7) < 1
