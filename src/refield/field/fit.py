@@ -31,7 +31,7 @@ class FitConfig:
     max_seconds: float | None = None
     """stop in time: the learning rate follows whichever of steps and seconds is further on"""
     samples: int = 8192
-    """a step; the number of rays follows from how many samples a ray needs, and behind the first surface it needs none"""
+    """a step; the rays follow from how many samples each needs, and behind the first surface it needs none"""
     samples_per_ray: float = 40
     """the lattice along the ray is made coarser, up to 1.5 times, while a ray needs more than this"""
     rate: float = 2e-2
@@ -89,7 +89,7 @@ def fit_field(
     contraction = place_contraction(capture)
     shape = config.field
     if config.finest_auto:
-        shape = replace(shape, finest=_finest_for(capture.train, contraction))
+        shape = replace(shape, finest=_finest_for(capture.train, contraction, shape.log2_table))
     step = 2 * contraction.radius * 4 / shape.finest  # about two pixels
     grid = torch.ones(128, 128, 128, dtype=torch.uint8)
     model = HashField(shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), config.seed)
@@ -115,11 +115,15 @@ def place_contraction(capture: Capture) -> Contraction:
     return Contraction(centre.float(), float(distance) * 0.6)
 
 
-def _finest_for(frames: tuple[Frame, ...], contraction: Contraction) -> int:
-    """Cells a side so that the finest is about a pixel wide where the axes meet; within [256, 4096]."""
-    pixel = min(float((f.centre.float() - contraction.centre).norm()) / max(f.camera.fx, f.camera.fy) for f in frames)
-    wanted = 4 * contraction.radius / pixel
-    return int(min(max(wanted, 256), 4096))
+def _finest_for(frames: tuple[Frame, ...], contraction: Contraction, log2_table: int) -> int:
+    """Cells a side so that the finest is about a pixel wide where the axes meet, within what a table can hold.
+
+    A surface crosses about n^2 of a level's n^3 cells. Past n = 2.5 sqrt(entries) collisions cost more than detail
+    gives: on real photographs 1253 cells came out 1.8 dB below 600 at 2^16 entries.
+    """
+    distances = torch.stack([(f.centre.float() - contraction.centre).norm() / f.camera.fx for f in frames])
+    wanted = 4 * contraction.radius / float(distances.median())
+    return int(min(max(wanted, 256), 2.5 * 2 ** (log2_table / 2)))
 
 
 class TableAdam:
@@ -193,7 +197,8 @@ class _Fit:
         samples = self.model.samples(rays, jitter=True)
         x, d = samples.positions(rays)
         radius = self.model.contraction.radius
-        sigmas, rgbs = scale_gradients(*self.model(x, d), samples, self.config.gradient_unit * radius)
+        sigmas, rgbs = self.model(x, d)
+        sigmas, rgbs = scale_gradients(sigmas, rgbs, samples, self.config.gradient_unit * radius)
         w = weights(sigmas, samples)
         rgb, opacity = accumulate_rgb(w, rgbs, samples)
         # what stays transparent is shown noise, so that only opaque surfaces explain the photos

@@ -27,13 +27,13 @@ class _ScaleGradient(torch.autograd.Function):
         return x.view_as(x)
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[no-untyped-def, override]
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[no-untyped-def]
         (scale,) = ctx.saved_tensors
         return grad * (scale if grad.dim() == 1 else scale[:, None]), None
 
 
 def scale_gradients(sigmas: Tensor, rgbs: Tensor, samples: Samples, unit: float) -> tuple[Tensor, Tensor]:
-    """Gradients times min((t / unit)^2, 1): samples near a camera, which few rays cross, do not grow floaters (§10.1)."""
+    """Gradients times min((t / unit)^2, 1): few rays cross what is near a camera; it must not grow floaters (§10.1)."""
     mid = (samples.t_starts + samples.t_ends) / 2
     scale = (mid / unit).square().clamp(max=1.0)
     return _ScaleGradient.apply(sigmas, scale), _ScaleGradient.apply(rgbs, scale)

@@ -178,7 +178,7 @@ class _TruncatedExp(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> Tensor:  # type: ignore[no-untyped-def, override]
+    def backward(ctx, grad: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
         (out,) = ctx.saved_tensors
         return grad * out.clamp(max=3e4)
 

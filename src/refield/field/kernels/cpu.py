@@ -7,8 +7,8 @@ the same for every thread count. Arrays come in as numpy views of torch's memory
 from __future__ import annotations
 
 import math
+from typing import Any
 
-import numba
 import numpy as np
 import torch
 from numba import njit, prange
@@ -18,7 +18,7 @@ from torch.autograd import Function
 from refield.field.kernels import reference
 from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 
-_JIT = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "cache": True, "nogil": True}
+_JIT: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "cache": True, "nogil": True}
 _P1, _P2 = np.uint32(reference.PRIMES[1]), np.uint32(reference.PRIMES[2])
 _BLOCK = 1024  # samples a thread takes at a time: their coordinates stay in L1 while a level's table stays in L2
 
@@ -135,7 +135,7 @@ class _HashEncode(Function):
         return out
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # type: ignore[no-untyped-def, override]
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # type: ignore[no-untyped-def]
         unit, tables = ctx.saved_tensors
         g, to_unit, to_tables = _np(grad), None, None
         if ctx.needs_input_grad[0]:
@@ -189,7 +189,7 @@ class _Weights(Function):
         return out
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[no-untyped-def, override]
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[no-untyped-def]
         sigmas, t0, t1, offsets, w = ctx.saved_tensors
         out = torch.empty_like(sigmas)
         _weights_backward(_np(sigmas), _np(t0), _np(t1), _np(offsets), _np(w), _np(grad), out.numpy())
@@ -234,7 +234,7 @@ class _Accumulate(Function):
         return out
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[no-untyped-def, override]
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[no-untyped-def]
         w, values, offsets = ctx.saved_tensors
         to_w, to_values = torch.empty_like(w), torch.empty_like(values)
         _accumulate_backward(_np(w), _np(values), _np(offsets), _np(grad), to_w.numpy(), to_values.numpy())
@@ -275,7 +275,7 @@ class _Distortion(Function):
         return out
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[no-untyped-def, override]
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[no-untyped-def]
         slope, offsets = ctx.saved_tensors
         return slope * torch.repeat_interleave(grad, offsets[1:] - offsets[:-1]), None, None, None
 
@@ -389,7 +389,9 @@ _NO_NET = (np.empty((0, 1, 2), np.float32), np.empty(0, np.int32), np.empty((0, 
            np.empty(0, np.float32), np.float32(np.inf))  # fmt: skip
 
 
-def _marched(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: tuple) -> tuple[Tensor, Tensor, Tensor]:
+def _marched(
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: tuple[Any, ...]
+) -> tuple[Tensor, Tensor, Tensor]:
     n, room = len(rays[0]), 64
     counts = np.empty(n, np.int64)
     arrays = tuple(_np(r) for r in rays)
@@ -511,6 +513,3 @@ def _scatter_max(values, cells, into):  # type: ignore[no-untyped-def]
 def scatter_max(values: Tensor, cells: Tensor, into: Tensor) -> None:
     """See `reference.scatter_max`."""
     _scatter_max(_np(values), _np(cells), into.numpy())
-
-
-THREADS = numba.config.NUMBA_NUM_THREADS

@@ -133,20 +133,20 @@ def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Te
     r = grid.shape[0]
     t = near + jitter * step
     starts, ends, owners = [], [], []
-    rays = torch.arange(len(origins), device=origins.device)
-    while len(rays):
-        x = origins[rays] + directions[rays] * t[:, None]
+    live = torch.arange(len(origins), device=origins.device)
+    while len(live):
+        x = origins[live] + directions[live] * t[:, None]
         m = ((x - centre) / radius).abs().amax(-1)
         dt = step * m.clamp_min(1.0) ** 1.5
-        mid = x + directions[rays] * (dt / 2)[:, None]
+        mid = x + directions[live] * (dt / 2)[:, None]
         cell = ((contract(mid, centre, radius) + 2) * (r / 4)).long().clamp(0, r - 1)
         hit = grid[cell[:, 0], cell[:, 1], cell[:, 2]] > 0
         starts.append(t[hit])
         ends.append((t + dt)[hit])
-        owners.append(rays[hit])
+        owners.append(live[hit])
         t = t + dt
         going = t < far
-        rays, t = rays[going], t[going]
+        live, t = live[going], t[going]
     owner = torch.cat(owners) if owners else torch.zeros(0, dtype=torch.long)
     order = torch.argsort(owner, stable=True)
     counts = torch.bincount(owner, minlength=len(origins))
