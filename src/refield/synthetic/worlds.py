@@ -80,7 +80,7 @@ class State:
     """(H, 2H, 3) linear radiance, latitude-longitude, z up"""
     sun: Triple | None = None
     """Irradiance of a hard light, linear RGB; None = the surroundings alone"""
-    sun_direction: Triple = (-0.45, 0.35, -0.82)
+    sun_direction: Triple = (-0.55, 0.45, -0.7)
     """The way the hard light travels"""
 
     def named(self, name: str) -> Item | None:
@@ -190,9 +190,9 @@ def _state(
     paving: Paving = "bricks",
     sun: Triple | None = None,
 ) -> State:
-    """A state on a floor; with a hard sun the surroundings have no soft one."""
+    """A state on a floor; with a hard sun the surroundings are dimmer and have no soft one."""
     ground = floor(rng, paving)
-    light = textures.surroundings(rng, sun=9.0 if sun is None else 0.0)
+    light = textures.surroundings(rng, sun=9.0) if sun is None else 0.5 * textures.surroundings(rng, sun=0.0)
     return State((ground, *items), light, sun)
 
 
@@ -275,7 +275,7 @@ def shadow(seed: int = 0) -> World:
     """A cube under a hard sun: its sharp shadow moves along."""
     rng = _rng(seed, "shadow")
     item = box_item(rng, "cube", _CUBE, 0.13, (-0.25, -0.25, 10))
-    before = _state(rng, (item,), "bricks", sun=(1.5, 1.4, 1.25))
+    before = _state(rng, (item,), "bricks", sun=(2.8, 2.6, 2.3))
     return _moved("shadow", before, "cube", item.turned(35, (0.5, 0.4, 0)))
 
 
