@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
-from refield.field.radiance import Field, HashField
-from refield.field.volrend import Rendering, composite
+from refield.field.radiance import Field
+from refield.field.volrend import Rendering, Samples, composite
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
 
 CHUNK = 16384  # rays; at 20 samples a ray the activations of a chunk take some 100 MB
 
 
+def visible_samples(field: Field, rays: Rays, jitter: bool = False) -> Samples:
+    """Where to evaluate a field: its own choice (``samples``) if it leaves out what is hidden, else its sampler's."""
+    own: Callable[[Rays, bool], Samples] | None = getattr(field, "samples", None)
+    return field.sampler(rays, jitter) if own is None else own(rays, jitter)
+
+
 def render_rays(field: Field, rays: Rays, jitter: bool = False) -> Rendering:
     """Eq. 1 for N rays at once. Differentiable with respect to whatever the field is differentiable in."""
-    samples = field.samples(rays, jitter) if isinstance(field, HashField) else field.sampler(rays, jitter)
+    samples = visible_samples(field, rays, jitter)
     x, d = samples.positions(rays)
     sigmas, rgbs = field(x, d)
     return composite(sigmas, rgbs, samples)

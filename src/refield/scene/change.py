@@ -32,8 +32,8 @@ class OccupancyGrid:
         """Trilinear value at world points (..., 3) -> (...,); 0 outside the box."""
         lo, hi = self.aabb.to(x.device, x.dtype)
         unit = (x - lo) / (hi - lo) * 2 - 1
-        grid = self.values.to(x.device, x.dtype).permute(2, 1, 0)[None, None]
-        flat = unit.reshape(1, -1, 1, 1, 3)
+        grid = self.values.to(x.device, x.dtype)[None, None]
+        flat = unit.flip(-1).reshape(1, -1, 1, 1, 3)  # grid_sample's first coordinate runs along the last axis
         out = functional.grid_sample(grid, flat, mode="bilinear", padding_mode="border", align_corners=True)
         inside = (unit.abs() <= 1).all(-1)
         return torch.where(inside, out.reshape(x.shape[:-1]), torch.zeros_like(x[..., 0]))

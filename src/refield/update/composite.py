@@ -6,12 +6,18 @@ the new light. Without a helper the old objects are cut out: nothing is left ins
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from refield.field.radiance import Field
+from refield.field.radiance import Field, HashField
+from refield.field.render import visible_samples
 from refield.field.sampling import OccupancySampler
+from refield.field.volrend import Samples
 from refield.field.warp import Move, inside_box, move_in, moves_of
+from refield.scene.capture import Rays
 from refield.scene.change import SceneChange
 from refield.update.light import Relighting
 from refield.update.region import Region, carved, move_out
@@ -46,6 +52,49 @@ class UpdatedField:
         if sampler is None:
             sampler = pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES)
         self.sampler = sampler
+        self._base = pretrained._base if isinstance(pretrained, UpdatedField) else pretrained
+        self._base = self._base if isinstance(self._base, HashField) else None
+        self._retold = self._retold_cells()
+        earlier = pretrained._marched if isinstance(pretrained, UpdatedField) else ()
+        self._marched: tuple[Tensor, ...] = tuple(_by_cells(self.sampler, b) for b in self.boxes) + earlier
+
+    def samples(self, rays: Rays, jitter: bool = False) -> Samples:
+        """Where to evaluate the field along rays; nothing behind the first opaque surface that never changed.
+
+        Cells that changed at this visit or an earlier one are all looked at; elsewhere the field is that of the
+        first visit, and marching through its density network ends a ray.
+        """
+        if self._base is None or not self._marched:
+            return visible_samples(self.pretrained, rays, jitter) if not self.boxes else self.sampler(rays, jitter)
+        known = replace(self.sampler, grid=self.sampler.grid * (1 - self._retold))
+        base = self._base
+        net = (base.encoding.tables, base.encoding.resolutions, base.density_in, base.density_out[0])
+        return interleaved(known.visible(rays, net, jitter), self._retold_samples(rays, jitter))
+
+    def _retold_samples(self, rays: Rays, jitter: bool) -> Samples:
+        """All samples in cells that changed; only the rays that come near any are marched, and no further."""
+        exits = torch.stack([_exit(rays, box) for box in self._marched]).amax(0)
+        near = (exits > 0).nonzero()[:, 0]
+        far = float(exits.max()) / self.sampler.contraction.radius if len(near) else 0.0
+        marcher = replace(self.sampler, grid=self.sampler.grid * self._retold, far=min(far, self.sampler.far))
+        found = marcher(rays[near], jitter)
+        counts = near.new_zeros(len(rays)).index_copy(0, near, found.ray_offsets.diff())
+        return Samples(found.t_starts, found.t_ends, torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
+
+    def _retold_cells(self) -> Tensor:
+        """(R, R, R) uint8: cells in which some point is answered for by a move, a helper or nobody, at this visit or
+        an earlier one."""
+        earlier = self.pretrained._retold if isinstance(self.pretrained, UpdatedField) else None
+        grid = torch.zeros_like(self.sampler.grid) if earlier is None else earlier.clone()
+        for box in self.boxes:
+            cells = self.sampler.cells_in(box)
+            x = self.sampler.points_in(cells, jitter=False)
+            _, _, owner, _, new = self._route(x, torch.zeros_like(x))
+            told = owner >= 0
+            told[new] = True
+            grid.view(-1)[cells[told]] = 1
+        # a cell whose centre is just outside may hold a corner that is inside
+        return functional.max_pool3d(grid[None, None].float(), 3, 1, 1)[0, 0].to(torch.uint8)
 
     def density(self, x: Tensor) -> Tensor:
         """World points (..., 3) -> sigma (...,), per world unit."""
@@ -94,3 +143,27 @@ class UpdatedField:
         """The new light on what did not move."""
         assert self.light is not None
         return torch.where(still[:, None], self.light.applied(x, rgb), rgb)
+
+
+def _by_cells(sampler: OccupancySampler, box: Tensor) -> Tensor:
+    """A world box (2, 3) grown by two and a half of the sampler's cells."""
+    space = sampler.contraction
+    reach = float(((box - space.centre) / space.radius).abs().max())
+    margin = 2.5 * 4 * space.radius / sampler.resolution * max(reach, 1.0) ** 2
+    return torch.stack([box[0] - margin, box[1] + margin])
+
+
+def _exit(rays: Rays, box: Tensor) -> Tensor:
+    """Distance at which each ray leaves a world box, (N,); 0 if it does not meet it."""
+    inverse = 1 / torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)
+    a, b = (box[0] - rays.origins) * inverse, (box[1] - rays.origins) * inverse
+    enter, leave = torch.minimum(a, b).amax(-1), torch.maximum(a, b).amin(-1)
+    return torch.where((leave > enter) & (leave > 0), leave, 0.0)
+
+
+def interleaved(a: Samples, b: Samples) -> Samples:
+    """Two sets of samples of the same rays as one, near to far on each ray."""
+    starts = torch.cat([a.t_starts, b.t_starts])
+    ray = torch.cat([a.ray_ids, b.ray_ids])
+    order = torch.argsort(ray.double() + starts.double() / (1 + starts.double()))
+    return Samples(starts[order], torch.cat([a.t_ends, b.t_ends])[order], a.ray_offsets + b.ray_offsets)

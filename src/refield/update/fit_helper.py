@@ -96,7 +96,7 @@ class HelperTraining:
         out = []
         with torch.no_grad():
             for chosen in torch.arange(len(lit.lessons)).split(_CHUNK):
-                woven, _ = self._woven(lit.lessons[chosen].rays, lit.fixed[chosen], jitter=False)
+                woven, _, _ = self._woven(lit.lessons[chosen].rays, lit.fixed[chosen], jitter=False)
                 out.append(accumulate_rgb(woven.weights, woven.rgb, woven.samples)[0])
         return torch.cat(out).clamp(0, 1)
 
@@ -111,11 +111,12 @@ class HelperTraining:
         rays = Rays(torch.cat([a.rays.origins for a, _ in drawn]), torch.cat([a.rays.directions for a, _ in drawn]))
         return rays, torch.cat([a.rgb for a, _ in drawn]), _joined([b for _, b in drawn])
 
-    def _woven(self, rays: Rays, fixed: Segments, jitter: bool) -> tuple[Woven, Tensor]:
-        """The batch's row of samples, and the positions (S, 3) of the helper's own."""
-        samples = self._outside_moved(self.helper.sampler(rays, jitter), rays)
+    def _woven(self, rays: Rays, fixed: Segments, jitter: bool) -> tuple[Woven, Tensor, Tensor]:
+        """The batch's row of samples; positions (S, 3) and densities (S,) of the helper's own."""
+        samples = self._outside_moved(self.helper.samples(rays, jitter), rays)
         x, d = samples.positions(rays)
-        return weave(fixed, samples, *self.helper(x, d)), x
+        sigmas, rgbs = self.helper(x, d)
+        return weave(fixed, samples, sigmas, rgbs), x, sigmas
 
     def _outside_moved(self, samples: Samples, rays: Rays) -> Samples:
         """Without the samples inside what moved in (§10.1.2)."""
@@ -131,7 +132,7 @@ class HelperTraining:
 
     def _step(self, step: int, rate: float) -> None:
         rays, truth, fixed = self._batch()
-        woven, x = self._woven(rays, fixed, jitter=True)
+        woven, x, sigmas = self._woven(rays, fixed, jitter=True)
         w = woven.weights
         rgb, opacity = accumulate_rgb(w, woven.rgb, woven.samples)
         rgb = rgb + (1 - opacity)[:, None] * torch.rand(len(rays), 3)
@@ -141,7 +142,7 @@ class HelperTraining:
         cells = self.helper.sampler.cells(x)
         loss = loss + self.config.emptiness * (own * self.empty[cells]).sum() / len(rays)
         self._descend(loss, rate)
-        self.occupancy.observe(step, x, own.detach())
+        self.occupancy.observe(step, x, own.detach(), sigmas.detach())
         per_ray = max(len(x) / len(rays), 0.5)
         self.rays_per_step = int(min(max(self.config.samples / per_ray, 1024), 8192))
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.radiance import Field
+from refield.field.render import visible_samples
 from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
@@ -66,7 +67,7 @@ def composite_once(field: Field, region: OccupancySampler, rays: Rays) -> Segmen
 
 
 def _composite_chunk(field: Field, region: OccupancySampler, rays: Rays) -> Segments:
-    samples = field.sampler(rays)
+    samples = visible_samples(field, rays)
     sigmas, rgbs = field(*samples.positions(rays))
     some = sigmas > 0
     mid = (samples.t_starts + samples.t_ends)[some] / 2

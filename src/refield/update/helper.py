@@ -28,7 +28,7 @@ def step_near(field: Field, point: Tensor) -> float:
     """Length of the old field's samples at a world point (3,), world units."""
     s = field.sampler
     reach = float(((point - s.contraction.centre) / s.contraction.radius).abs().max())
-    return s.step * max(reach, 1.0)
+    return s.step * max(reach, 1.0) ** 1.5
 
 
 def emptiness(change: SceneChange, cells: OccupancySampler) -> Tensor:
@@ -60,7 +60,7 @@ class HelperOccupancy:
         self.allowed = helper.sampler.grid.clone()
         self.trainer = OccupancyTrainer(helper, cull_from)
 
-    def observe(self, step: int, x: Tensor, w: Tensor) -> None:
-        """After each step: sample positions (S, 3) and their weights (S,)."""
-        self.trainer.observe(step, x, w)
+    def observe(self, step: int, x: Tensor, w: Tensor, sigmas: Tensor) -> None:
+        """After each step: samples' positions (S, 3), weights (S,) and densities (S,)."""
+        self.trainer.observe(step, x, w, sigmas)
         self.helper.looking_where(self.helper.sampler.grid & self.allowed)

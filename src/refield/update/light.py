@@ -29,8 +29,9 @@ class Relighting:
         """World points (S, 3) -> factors (S, 3); 1 outside the box."""
         lo, hi = self.aabb
         unit = (x - lo) / (hi - lo) * 2 - 1
-        volume = self.log_gain.permute(3, 2, 1, 0)[None]
-        out = functional.grid_sample(volume, unit[None, :, None, None], padding_mode="border", align_corners=True)
+        volume = self.log_gain.permute(3, 0, 1, 2)[None].contiguous()
+        at = unit.flip(-1)[None, :, None, None]  # grid_sample's first coordinate runs along the last axis
+        out = functional.grid_sample(volume, at, padding_mode="border", align_corners=True)
         factor = torch.exp(out.reshape(3, -1).T)
         return torch.where(inside_box(x.detach(), self.aabb)[:, None], factor, torch.ones_like(factor))
 
@@ -86,7 +87,7 @@ def fit_light(seen: Sightings, box: Tensor, spacing: float) -> Relighting | None
 def _confirmed(seen: Sightings, views: Tensor, box: Tensor, spacing: float) -> Tensor:
     """Nodes (X, Y, Z) bool around which the factors of the other photos lower a photo's error."""
     shape = _shape(box, spacing)
-    gains, errors = [], []
+    errors = []
     for view in views:
         out = seen.view == view
         gain = _pyramid(seen[~out], box, spacing)
@@ -94,9 +95,8 @@ def _confirmed(seen: Sightings, views: Tensor, box: Tensor, spacing: float) -> T
         factor = _gather(gain, left_out.x, box)
         before = (left_out.photo - left_out.rendered).square().sum(-1)
         after = (left_out.photo - (left_out.rendered * factor).clamp(0, 1)).square().sum(-1)
-        gains.append(_scatter(torch.stack([before, after], -1), left_out.x, box, shape))
-        errors.append(len(left_out))
-    before, after = _smoothed(sum(gains[1:], gains[0])).unbind(-1)
+        errors.append(_scatter(torch.stack([before, after], -1), left_out.x, box, shape))
+    before, after = _smoothed(sum(errors[1:], errors[0])).unbind(-1)
     return (after < 0.9 * before) & (before > 1e-6)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -49,9 +49,10 @@ class Region:
         box = self.box
         space = Contraction(box.mean(0), float((box[1] - box[0]).max()) / 2 * 1.02)
         empty = OccupancySampler(space, torch.zeros(resolution, resolution, resolution, dtype=torch.uint8), step)
-        cells = torch.arange(resolution**3)
-        inside = torch.cat([self.contains(empty.points_in(c, jitter=False)) for c in cells.split(1 << 18)])
-        return OccupancySampler(space, inside.to(torch.uint8).reshape(empty.grid.shape), step)
+        cells = empty.cells_in(box)
+        grid = empty.grid.clone()
+        grid.view(-1)[cells] = self.contains(empty.points_in(cells, jitter=False)).to(torch.uint8)
+        return replace(empty, grid=grid)
 
 
 def meets(sampler: OccupancySampler, rays: Rays) -> Tensor:

@@ -1,0 +1,93 @@
+"""Which pixels may teach (Fig. 12)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from refield.scene.camera import Camera
+from refield.scene.capture import Frame, camera_rays
+from refield.scene.change import ObjectChange, SceneChange
+from refield.update.supervision import changed_pixels, exposure, old_ring, silhouette
+from tests.update.worlds import Ball, at, grid_of, looking_from
+
+SIZE = 100
+CAMERA = Camera(SIZE, SIZE, 130.0, 130.0, 50.0, 50.0)
+FRAME = Frame(Path("none.png"), CAMERA, "none.png", looking_from(0.7, 3.0, 1.6))
+BALL = Ball(at(-0.2, 0.2, 0.0), 0.25)
+NEW = at(0.5, -0.3, 0.0)
+
+
+def disc(u: float, v: float, radius: float) -> torch.Tensor:
+    y, x = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+    return (x - u) ** 2 + (y - v) ** 2 < radius**2
+
+
+def moved_ball(masks: tuple[torch.Tensor | None, ...], masks_in: tuple[torch.Tensor | None, ...]) -> SceneChange:
+    return SceneChange((ObjectChange("moved", grid_of(BALL), NEW, masks, masks_in),))
+
+
+def test_the_ring_lies_between_shadow_and_far_field_and_not_where_something_moved_in() -> None:
+    out, into = disc(40, 50, 10), disc(60, 50, 6)
+    ring = old_ring(moved_ball((out,), (into,)), 0, FRAME, shadow=0.02, far=0.15)
+    assert ring is not None
+    y, x = torch.nonzero(ring, as_tuple=True)
+    # 3 x 3 dilations grow squares: distances are Chebyshev to the disc, bounded by its Euclidean radius
+    distance = ((x + 0.5 - 40) ** 2 + (y + 0.5 - 50) ** 2).sqrt()
+    assert float(distance.min()) > 10 + 1.5
+    assert float(distance.max()) < 10 + 15 * math.sqrt(2) + 1
+    assert not (ring & into).any() and not (ring & out).any()
+    assert ring.sum() > 300
+
+
+def test_a_photo_with_an_unsure_mask_is_left_out() -> None:
+    assert old_ring(moved_ball((None,), (disc(60, 50, 6),)), 0, FRAME, 0.01, 0.15) is None
+    assert old_ring(moved_ball((disc(40, 50, 9),), (None,)), 0, FRAME, 0.01, 0.15) is None
+
+
+def test_missing_masks_are_projected_from_the_grid() -> None:
+    given = old_ring(
+        moved_ball((silhouette(grid_of(BALL), FRAME),), (silhouette(grid_of(Ball(NEW, 0.25)), FRAME),)), 0, FRAME, 0.01, 0.1
+    )
+    projected = old_ring(moved_ball((), ()), 0, FRAME, 0.01, 0.1)
+    assert given is not None and projected is not None
+    assert float((given ^ projected).float().mean()) < 0.03
+
+
+def test_an_added_object_has_a_ring_around_its_new_place() -> None:
+    into = disc(60, 50, 8)
+    ring = old_ring(SceneChange((ObjectChange("added", grid_of(BALL), masks_in=(into,)),)), 0, FRAME, 0.01, 0.1)
+    assert ring is not None and ring.any() and not (ring & into).any()
+
+
+def test_the_silhouette_is_where_rays_meet_the_object() -> None:
+    rays = camera_rays(CAMERA, FRAME.world_from_cam)
+    centre = BALL.world_from_ball[:3, 3].float()
+    along = ((centre - rays.origins) * rays.directions).sum(-1, keepdim=True)
+    hit = ((rays.origins + along * rays.directions - centre).norm(dim=-1) < 0.25).reshape(SIZE, SIZE)
+    seen = silhouette(grid_of(BALL), FRAME)
+    assert float((hit & seen).sum() / (hit | seen).sum()) > 0.93
+
+
+def test_changed_pixels_hold_both_places() -> None:
+    changed = changed_pixels(moved_ball((), ()), 0, FRAME)
+    for place in (BALL.world_from_ball, NEW):
+        uv, _ = CAMERA.project(torch.linalg.inv(FRAME.world_from_cam) [:3] @ torch.cat([place[:3, 3], torch.ones(1).double()]))
+        assert changed[int(uv[1]), int(uv[0])]
+    assert changed.mean() < 0.6
+
+
+def test_exposure_is_found_on_unchanged_pixels_only_and_else_left_alone() -> None:
+    g = torch.Generator().manual_seed(0)
+    truth = torch.rand(60, 60, 3, generator=g) * 0.6 + 0.1
+    noisy = truth + 0.01 * torch.randn(60, 60, 3, generator=g)
+    changed = np.zeros((60, 60), bool)
+    changed[:20] = True
+    photo = noisy * 0.8 + 0.05
+    photo[:20] = 1.0  # what changed may look like anything
+    affine = exposure(photo, truth, changed)
+    assert float((photo * affine[0] + affine[1] - truth)[20:].abs().mean()) < 0.015
+    assert torch.equal(exposure(noisy, truth, changed), torch.tensor([[1.0] * 3, [0.0] * 3]))
