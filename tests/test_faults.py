@@ -244,12 +244,15 @@ def test_numbers_do_not_depend_on_the_locale(place, locale):
 
 
 def test_photos_of_another_scene(place, monkeypatch, capsys):
-    """Noise instead of the scene: refused, nothing published."""
+    """Coloured blocks instead of the scene: refused, nothing published."""
     monkeypatch.chdir(place)
+    enough = ["--fit.steps", "200", "--fit.samples", "4096", "--fit.field.log2-table", "12", "--fit.field.width", "16"]
+    assert main(["train", "data", "trained", *TINY_FIT, *enough]) == 0
     write_capture(place / "other", 4, turn=0.2)
-    for path in (place / "other/images").iterdir():
-        write_image(path, torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(len(path.name))))
+    for i, path in enumerate(sorted((place / "other/images").iterdir())):
+        blocks = torch.rand(3, 4, 3, generator=torch.Generator().manual_seed(i))
+        write_image(path, blocks.repeat_interleave(8, 0).repeat_interleave(8, 1))
     before = contents(place)
-    assert main(["update", "work", "other"]) == 2
-    assert "scene" in capsys.readouterr().err
+    assert main(["update", "trained", "other"]) == 2
+    assert "is this the same scene?" in capsys.readouterr().err
     assert contents(place) == before
