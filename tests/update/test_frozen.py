@@ -73,7 +73,10 @@ def test_choosing_rays_chooses_their_segments() -> None:
     rays = views()
     fixed = composite_once(FROZEN, WIDE.sampler(STEP), rays)
     chosen = torch.tensor([900, 5, 5, 2000, 1300])
-    part, again = fixed[chosen], composite_once(FROZEN, WIDE.sampler(STEP), Rays(rays.origins[chosen], rays.directions[chosen]))
+    part, again = (
+        fixed[chosen],
+        composite_once(FROZEN, WIDE.sampler(STEP), Rays(rays.origins[chosen], rays.directions[chosen])),
+    )
     assert torch.equal(part.offsets, again.offsets)
     torch.testing.assert_close(part.optical_depth, again.optical_depth)
     torch.testing.assert_close(part.rgb, again.rgb)

@@ -16,7 +16,7 @@ from refield.scene.images import write_image
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.train import UpdateProgress, update_field
-from tests.update.worlds import Ball, BallWorld, at, grid_of, looking_from, moved
+from tests.update.worlds import Ball, BallWorld, at, looking_from, moved
 
 SIZE = 48
 CAMERA = Camera(SIZE, SIZE, 62.0, 62.0, SIZE / 2, SIZE / 2)

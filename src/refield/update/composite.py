@@ -44,6 +44,8 @@ class UpdatedField:
         """``region`` is where the helper speaks (M_out of the change by default); with no helper it is cut out
         (the objects' own grids by default). ``sampler`` is recomputed where things changed unless it is given."""
         self.pretrained, self.change, self.helper, self.light = pretrained, change, helper, light
+        self.why_stopped = ""
+        """what ended the helper's training, in words; empty if it was not trained here"""
         if region is None:
             region = carved(change) if helper is None else move_out(change, DILATION)
         self.region = region
@@ -52,8 +54,7 @@ class UpdatedField:
         if sampler is None:
             sampler = pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES)
         self.sampler = sampler
-        self._base = pretrained._base if isinstance(pretrained, UpdatedField) else pretrained
-        self._base = self._base if isinstance(self._base, HashField) else None
+        self._base: HashField | None = _base_of(pretrained)
         self._retold = self._retold_cells()
         earlier = pretrained._marched if isinstance(pretrained, UpdatedField) else ()
         self._marched: tuple[Tensor, ...] = tuple(_by_cells(self.sampler, b) for b in self.boxes) + earlier
@@ -143,6 +144,13 @@ class UpdatedField:
         """The new light on what did not move."""
         assert self.light is not None
         return torch.where(still[:, None], self.light.applied(x, rgb), rgb)
+
+
+def _base_of(field: Field) -> HashField | None:
+    """The hash field of the first visit, if that is what lies at the bottom."""
+    if isinstance(field, UpdatedField):
+        return field._base
+    return field if isinstance(field, HashField) else None
 
 
 def _by_cells(sampler: OccupancySampler, box: Tensor) -> Tensor:

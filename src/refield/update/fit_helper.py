@@ -12,15 +12,13 @@ from torch import Tensor
 
 from refield.field.fit import NonFiniteError, TableAdam, rate_factor
 from refield.field.losses import colour_loss, distortion_loss
-from refield.field.radiance import Field, HashField
-from refield.field.sampling import OccupancySampler
+from refield.field.radiance import HashField
 from refield.field.volrend import Samples, accumulate_rgb
 from refield.field.warp import Move, moves_of
-from refield.scene.capture import Capture, Rays
+from refield.scene.capture import Rays
 from refield.scene.change import SceneChange
-from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
-from refield.update.frozen import Segments, Woven, composite_once, weave
+from refield.update.frozen import Segments, Woven, weave
 from refield.update.helper import HelperOccupancy, emptiness
 from refield.update.supervision import Lessons
 

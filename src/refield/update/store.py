@@ -53,9 +53,7 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
     try:
         regions = range(facts["regions"])
         grids = [OccupancyGrid(tensors[f"region.{i}.aabb"], tensors[f"region.{i}.values"]) for i in regions]
-        light = (
-            Relighting(tensors["light.aabb"], tensors["light.log_gain"]) if "light.aabb" in tensors else None
-        )
+        light = Relighting(tensors["light.aabb"], tensors["light.log_gain"]) if "light.aabb" in tensors else None
         own = {name.removeprefix("helper."): t for name, t in tensors.items() if name.startswith("helper.")}
         helper = HashField.from_state(own, facts["helper"]) if facts["helper"] is not None else None
         sampler = replace(pretrained.sampler, grid=tensors["occupancy"])

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from refield.field.pixels import PixelBank
-from refield.field.radiance import Field, HashField
+from refield.field.radiance import Field
 from refield.field.render import render_many
 from refield.field.sampling import OccupancySampler
-from refield.field.warp import moves_of
-from refield.scene.capture import Capture, Rays
+from refield.scene.capture import Capture
 from refield.scene.change import SceneChange
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
@@ -22,16 +21,18 @@ from refield.update.frozen import composite_once
 from refield.update.helper import new_helper, step_near
 from refield.update.light import Relighting, Sightings, fit_light
 from refield.update.region import Region, meets, move_out
-from refield.update.supervision import Lessons, changed_pixels, new_lessons, old_ring
+from refield.update.supervision import Lessons, Places, changed_pixels, new_lessons, old_ring, places_of
+from refield.vision.pixels import dilate
 
-_RING_RAYS = 60_000  # of the old photos; more add time and nothing to learn
+DEFAULTS = UpdateConfig()
+_RING_RAYS = 40_000  # of the old photos; more add time and nothing to learn
 
 
 def update_field(
     capture: Capture,
     field: Field,
     change: SceneChange,
-    config: UpdateConfig = UpdateConfig(),
+    config: UpdateConfig = DEFAULTS,
     on_stage: Callable[[str], None] | None = None,
     on_progress: Callable[[UpdateProgress], None] | None = None,
 ) -> UpdatedField:
@@ -50,25 +51,28 @@ def update_field(
     if not change.objects or not change.frames:
         return cut
     say("light")
-    sparse, rendered = new_lessons(change.frames, cut, change)
-    light = _light(sparse, field, change) if config.relight else None
+    places = places_of(change)
+    changed = [changed_pixels(change, places, i, f) for i, f in enumerate(change.frames)]
+    sparse = new_lessons(change.frames, cut, changed)
+    light = _light(sparse, field, change, changed) if config.relight else None
     say("supervise")
     wide = move_out(change, config.dilation)
-    step = step_near(field, wide.box.mean(0))
-    region = wide.sampler(step)
-    old = _old_lessons(capture, field, change, region, config, light)
+    region = wide.sampler(step_near(field, wide.box.mean(0)))
+    old = _old_lessons(capture, field, places, region, config, light)
     sparse = sparse[meets(region, sparse.rays).nonzero()[:, 0]]
     say("freeze")
     frozen = UpdatedField(field, change, region=wide, light=light)
-    lit = [Lit(part, composite_once(frozen, region, part.rays)) for part in (sparse, old)]
-    taught, judges = zip(*(_split(part, config.held_out) for part in lit))
+    new_taught, judge = _split(Lit(sparse, composite_once(frozen, region, sparse.rays)), config.held_out)
+    old_taught = Lit(old, composite_once(frozen, region, old.rays))
     say("train")
     helper = new_helper(region, change.frames, config.seed)
-    run = HelperTraining(helper, change, *taught, judges[0], config)
+    run = HelperTraining(helper, change, new_taught, old_taught, judge, config)
     run.run(on_progress)
     say("show")
     helper.eval().requires_grad_(False)
-    return UpdatedField(field, change, helper, region=move_out(change, config.shown), light=light)
+    updated = UpdatedField(field, change, helper, region=move_out(change, config.shown), light=light)
+    updated.why_stopped = run.why_stopped
+    return updated
 
 
 def _split(lit: Lit, every: int) -> tuple[Lit, Lit]:
@@ -80,9 +84,9 @@ def _split(lit: Lit, every: int) -> tuple[Lit, Lit]:
     return taught, judge
 
 
-def _light(sparse: Lessons, field: Field, change: SceneChange) -> Relighting | None:
-    """The light on what did not change, from pixels that show it in every new photo."""
-    still = torch.cat([torch.from_numpy(~changed_pixels(change, i, f, 0.01)).reshape(-1) for i, f in enumerate(change.frames)])
+def _light(sparse: Lessons, field: Field, change: SceneChange, changed: list[np.ndarray]) -> Relighting | None:
+    """The light on what did not change, from the new photos' pixels that show it."""
+    still = torch.cat([torch.from_numpy(~dilate(c, math.ceil(0.01 * c.shape[1]))).reshape(-1) for c in changed])
     seen = sparse[still.nonzero()[:, 0]]
     was = render_many(field, seen.rays)
     x = seen.rays.origins + seen.rays.directions * was.depth[:, None]
@@ -95,13 +99,18 @@ def _light(sparse: Lessons, field: Field, change: SceneChange) -> Relighting | N
 
 
 def _old_lessons(
-    capture: Capture, field: Field, change: SceneChange, region: OccupancySampler, config: UpdateConfig, light: Relighting | None
+    capture: Capture,
+    field: Field,
+    places: Places,
+    region: OccupancySampler,
+    config: UpdateConfig,
+    light: Relighting | None,
 ) -> Lessons:
     """Ring pixels of the old photos whose rays meet the region, in the new light."""
     bank = PixelBank(capture.train)
     chosen = []
     for i, frame in enumerate(capture.train):
-        ring = old_ring(change, i, frame, config.shadow, config.far)
+        ring = old_ring(places, i, frame, config.shadow, config.far)
         if ring is not None:
             chosen.append(ring.reshape(-1).nonzero()[:, 0] + bank.starts[i])
     pixels = torch.cat(chosen) if chosen else torch.zeros(0, dtype=torch.long)
