@@ -26,7 +26,7 @@ MAY_IMPORT = {
     "__main__": None,
 }
 HEAVY = {"torch", "numpy", "scipy", "numba", "cv2", "pycolmap", "mitsuba", "PIL"}
-LATE = {"mitsuba", "drjit", "pycolmap", "transformers"}  # never when a module is loaded
+LATE = {"mitsuba", "drjit", "transformers"}  # extras: never when a module is loaded
 
 
 def rooms():
@@ -34,11 +34,7 @@ def rooms():
 
 
 def files(room):
-    return (
-        [SOURCE / f"{room}.py"]
-        if (SOURCE / f"{room}.py").is_file()
-        else sorted((SOURCE / room).rglob("*.py"))
-    )
+    return [SOURCE / f"{room}.py"] if (SOURCE / f"{room}.py").is_file() else sorted((SOURCE / room).rglob("*.py"))
 
 
 def imported(path, *, top_level=False):
@@ -73,10 +69,7 @@ def test_imports_go_down(room):
 
 def test_heavy_optional_modules_are_imported_late():
     found = {
-        f"{p.name}: {n}"
-        for p in SOURCE.rglob("*.py")
-        for n in imported(p, top_level=True)
-        if n.split(".")[0] in LATE
+        f"{p.name}: {n}" for p in SOURCE.rglob("*.py") for n in imported(p, top_level=True) if n.split(".")[0] in LATE
     }
     assert not found
 

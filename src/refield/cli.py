@@ -30,7 +30,7 @@ _DISK = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM, errno.EDQUOT)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    previous = signal.signal(signal.SIGTERM, _terminate)  # so that half-built folders are cleared away
+    previous = signal.getsignal(signal.SIGTERM)
     try:
         return _command(arguments)
     except InputError as error:
@@ -63,6 +63,8 @@ def _command(arguments: list[str]) -> int:
     import tyro
 
     module = importlib.import_module(f"refield.commands.{name}")
+    # so that half-built folders are cleared away; after the imports, because pycolmap takes the signal for itself
+    signal.signal(signal.SIGTERM, _terminate)
     options = tyro.cli(getattr(module, name.capitalize()), args=arguments[1:], prog=f"refield {name}")
     module.run(options)
     return 0

@@ -33,9 +33,7 @@ def change(tmp_path, capture):
         ObjectChange("added", grid, masks_in=masks),
     )
     new = write_capture(tmp_path / "visit" / "photos", 2, DISTORTED, turn=0.2)
-    photos = tuple(
-        PlacedPhoto(f"their/{f.name}", "used", "", replace(f, name=f"their/{f.name}")) for f in new.frames
-    )
+    photos = tuple(PlacedPhoto(f"their/{f.name}", "used", "", replace(f, name=f"their/{f.name}")) for f in new.frames)
     photos += (PlacedPhoto("blurred.png", "rejected", "7 inliers"),)
     seen = (torch.rand(24, 32) > 0.5, torch.rand(24, 32) > 0.5)
     return SceneChange(objects, photos, "because", seen, seen[::-1])
@@ -74,9 +72,7 @@ def test_the_json_is_the_one_that_is_promised(tmp_path, change):
     assert first["kind"] == "moved" and first["grid"] == "grid_0.npz"
     assert np.array(first["new_from_old"]).shape == (4, 4) and np.array(first["aabb"]).shape == (2, 3)
     assert record["objects"][1]["new_from_old"] is None
-    assert (
-        record["photos"][0]["file"] == "their/images/000.png" and record["photos"][2]["status"] == "rejected"
-    )
+    assert record["photos"][0]["file"] == "their/images/000.png" and record["photos"][2]["status"] == "rejected"
     assert np.array(record["photos"][0]["world_from_cam"]).shape == (4, 4)
     with np.load(folder / "grid_0.npz", allow_pickle=False) as grid:
         assert set(grid) == {"aabb", "values"}

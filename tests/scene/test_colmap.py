@@ -1,5 +1,7 @@
 """A COLMAP model, text and binary, gives the same rays back."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +13,7 @@ from refield.scene.colmap import PARAMETERS, load_colmap, save_colmap
 from refield.scene.errors import InputError
 from refield.scene.load import load_capture
 from tests.captures import CAMERA, DISTORTED, write_capture
+from tests.conftest import HERE
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -113,3 +116,20 @@ def test_a_damaged_model_is_named(tmp_path, text):
         load_colmap(tmp_path)
     with pytest.raises(InputError, match="no COLMAP model"):
         load_colmap(tmp_path / "images")
+
+
+_TERMINATED = """
+import os, signal, sys
+from pathlib import Path
+signal.signal(signal.SIGTERM, lambda *a: sys.exit(77))
+from refield.scene.colmap import load_colmap
+load_colmap(Path(sys.argv[1]))
+os.kill(os.getpid(), signal.SIGTERM)
+"""
+
+
+def test_pycolmap_does_not_take_our_signals(tmp_path):
+    """Its import installs a handler of SIGTERM that prints a stack trace and kills."""
+    save_colmap(tmp_path / "sparse" / "0", capture_with_points(tmp_path))
+    done = subprocess.run([sys.executable, "-c", _TERMINATED, str(tmp_path)], env=HERE, stderr=subprocess.DEVNULL)
+    assert done.returncode == 77

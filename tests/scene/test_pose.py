@@ -72,9 +72,7 @@ def test_exp_of_a_known_turn(a, b):
     turned = pose.rotate(pose.exp(quarter), torch.tensor([1.0, 0, 0], dtype=torch.float64))
     assert torch.allclose(turned, torch.tensor([0.0, 1, 0], dtype=torch.float64), atol=1e-12)
     assert float(pose.angle_between(pose.exp(a), pose.exp(a))) < 1e-5
-    assert torch.isclose(
-        pose.angle_between(pose.exp(a), pose.exp(b)), pose.angle_between(pose.exp(b), pose.exp(a))
-    )
+    assert torch.isclose(pose.angle_between(pose.exp(a), pose.exp(b)), pose.angle_between(pose.exp(b), pose.exp(a)))
 
 
 @relaxed
@@ -89,6 +87,4 @@ def test_nearest_rotation_is_a_rotation_and_near(twist, noise):
 
 def test_nearest_rotation_of_a_reflection_is_none():
     mirrored = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
-    assert torch.isclose(
-        torch.linalg.det(pose.nearest_rotation(mirrored)), torch.tensor(1.0, dtype=torch.float64)
-    )
+    assert torch.isclose(torch.linalg.det(pose.nearest_rotation(mirrored)), torch.tensor(1.0, dtype=torch.float64))

@@ -50,9 +50,7 @@ def same_rays(a: Frame, b: Frame) -> bool:
 focal = st.floats(20, 100)
 small = st.floats(-0.05, 0.05)
 cameras = st.builds(Camera, st.just(8), st.just(6), focal, focal, small, small, small, small, small, small)
-poses = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(
-    lambda v: exp(torch.tensor(v, dtype=torch.float64))
-)
+poses = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(lambda v: exp(torch.tensor(v, dtype=torch.float64)))
 
 
 @settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -81,9 +79,7 @@ def test_opengl_axes(data):
     contents["frames"] = contents["frames"][:1]
     contents["frames"][0]["transform_matrix"] = torch.eye(4).tolist()
     (frame,) = load_transforms(put(folder, contents)).frames
-    rays = camera_rays(
-        frame.camera, frame.world_from_cam, torch.tensor([[16.0, 12.0], [16.0, 0.0], [32.0, 12.0]])
-    )
+    rays = camera_rays(frame.camera, frame.world_from_cam, torch.tensor([[16.0, 12.0], [16.0, 0.0], [32.0, 12.0]]))
     assert torch.allclose(rays.directions[0], torch.tensor([0.0, 0.0, -1.0]), atol=1e-7)
     assert rays.directions[1][1] > 0 and rays.directions[2][0] > 0
 

@@ -116,9 +116,7 @@ class ObjectChange:
 
     def __post_init__(self) -> None:
         if (self.kind == "moved") != (self.new_from_old is not None):
-            raise ValueError(
-                f"new_from_old belongs to a moved object, and only to one (kind is {self.kind!r})"
-            )
+            raise ValueError(f"new_from_old belongs to a moved object, and only to one (kind is {self.kind!r})")
 
     @property
     def old_from_new(self) -> Tensor:

@@ -5,6 +5,8 @@ COLMAP's axes and pixel centres (0.5, 0.5) are ours; its poses are ``cam_from_wo
 
 from __future__ import annotations
 
+import signal
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +67,7 @@ def save_colmap(folder: Path, capture: Capture, *, text: bool = False) -> None:
     Raises:
         ValueError: a camera has k3, which COLMAP's OPENCV model lacks.
     """
-    import pycolmap
-
+    pycolmap = _pycolmap()
     model = pycolmap.Reconstruction()
     known: dict[Camera, int] = {}
     for index, frame in enumerate(capture.frames, start=1):
@@ -82,22 +83,26 @@ def save_colmap(folder: Path, capture: Capture, *, text: bool = False) -> None:
     (model.write_text if text else model.write)(str(folder))
 
 
-def _largest(folder: Path, warn: Warn) -> tuple[Path, Any]:
-    """The model with the most registered images, and its folder."""
+def _pycolmap() -> Any:
+    """The module, quiet, and without the handler of SIGTERM that it installs: it would kill before we clear up."""
     import pycolmap
 
     pycolmap.logging.minloglevel = 2  # its progress lines would drown ours
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+    return pycolmap
+
+
+def _largest(folder: Path, warn: Warn) -> tuple[Path, Any]:
+    """The model with the most registered images, and its folder."""
+    pycolmap = _pycolmap()
     models = []
     for path in find_models(folder):
         try:
             models.append((path, pycolmap.Reconstruction(str(path))))
         except Exception as error:  # the reader raises several C++ types; all mean an unusable file
-            reason = (
-                str(error).strip().splitlines()[-1][-120:] if str(error).strip() else type(error).__name__
-            )
-            raise InputError(
-                path, f"is not a readable COLMAP model ({reason})", "export the model again"
-            ) from None
+            reason = str(error).strip().splitlines()[-1][-120:] if str(error).strip() else type(error).__name__
+            raise InputError(path, f"is not a readable COLMAP model ({reason})", "export the model again") from None
     if not models:
         raise InputError(folder, "holds no COLMAP model", "give a folder with sparse/0/cameras.bin or .txt")
     path, model = max(models, key=lambda m: m[1].num_reg_images())

@@ -38,15 +38,11 @@ def read_json(path: Path) -> dict[str, Any]:
             raise InputError(path, f"the file has {size / 2**20:.0f} MB", f"{limit}; is it the right file?")
         text = path.read_bytes().decode("utf-8-sig")
     except OSError as error:
-        raise InputError(
-            path, f"cannot be read ({error.strerror})", "check the path and its permissions"
-        ) from None
+        raise InputError(path, f"cannot be read ({error.strerror})", "check the path and its permissions") from None
     except UnicodeDecodeError:
         raise InputError(path, "is not UTF-8 text", "save it as plain JSON") from None
     try:
-        data = json.loads(
-            text, parse_constant=_no_constant, parse_float=_finite_float, object_pairs_hook=_unique_keys
-        )
+        data = json.loads(text, parse_constant=_no_constant, parse_float=_finite_float, object_pairs_hook=_unique_keys)
     except RecursionError:
         raise InputError(path, "is nested too deeply to be a camera file", "check the file") from None
     except ValueError as error:

@@ -68,9 +68,7 @@ def read_size(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[int, int]:
         return (height, width) if _orientation(image) in _SWAPPED else (width, height)
 
 
-def read_image(
-    path: Path, *, max_pixels: int = MAX_PIXELS, background: tuple[int, int, int] = (0, 0, 0)
-) -> Tensor:
+def read_image(path: Path, *, max_pixels: int = MAX_PIXELS, background: tuple[int, int, int] = (0, 0, 0)) -> Tensor:
     """An image as uint8 (H, W, 3), upright; what is transparent shows ``background``.
 
     Raises:
@@ -150,7 +148,5 @@ def frame_image(photo: Photo) -> Tensor:
     height, width = image.shape[:2]
     if (width, height) != (photo.camera.width, photo.camera.height):
         expected = f"its camera says {photo.camera.width}x{photo.camera.height}"
-        raise InputError(
-            photo.path, f"has {width}x{height} pixels, {expected}", "correct w and h, or the image"
-        )
+        raise InputError(photo.path, f"has {width}x{height} pixels, {expected}", "correct w and h, or the image")
     return image

@@ -31,9 +31,7 @@ def read_camera(entry: Entry, where: str, size: tuple[int, int] | None) -> Camer
         raise InputError(f"{where}: is_fisheye", "fisheye cameras are not supported", "undistort the images")
     for key in _UNSUPPORTED:
         if number(entry, key, where, 0.0):
-            raise InputError(
-                f"{where}: {key}", "this distortion term is not supported", "undistort the images"
-            )
+            raise InputError(f"{where}: {key}", "this distortion term is not supported", "undistort the images")
     width, height = _size(entry, where, size)
     fx, fy = _focal(entry, where, width, height)
     cx, cy = number(entry, "cx", where, width / 2), number(entry, "cy", where, height / 2)
@@ -60,9 +58,7 @@ def fitted(camera: Camera, size: tuple[int, int], where: str) -> Camera:
     # rounding each side to whole pixels moves the ratio by half a pixel at either end
     if abs(width - camera.width * height / camera.height) >= 1 + width / camera.width / 2:
         what = f"the image has {width}x{height} pixels but w, h say {camera.width}x{camera.height}"
-        remedy = (
-            "correct w and h, or give the image as it was calibrated (cropping and turning are not undone)"
-        )
+        remedy = "correct w and h, or give the image as it was calibrated (cropping and turning are not undone)"
         raise InputError(where, what, remedy)
     return camera.scaled(width, height)
 
@@ -104,17 +100,11 @@ def _focal(entry: Entry, where: str, width: int, height: int) -> tuple[float, fl
         elif f"camera_angle_{axis}" in entry:
             angle = number(entry, f"camera_angle_{axis}", where, None)
             if not 0 < angle < math.pi:
-                raise InputError(
-                    f"{where}: camera_angle_{axis}", f"{angle:g} is not in (0, pi)", "give radians"
-                )
+                raise InputError(f"{where}: camera_angle_{axis}", f"{angle:g} is not in (0, pi)", "give radians")
             found[axis] = pixels / 2 / math.tan(angle / 2)
     if not found or ("x" not in found and "fl_y" in entry):
-        raise InputError(
-            f"{where}: fl_x", "no focal length is given", "add fl_x in pixels, or camera_angle_x"
-        )
+        raise InputError(f"{where}: fl_x", "no focal length is given", "add fl_x in pixels, or camera_angle_x")
     for axis, focal in found.items():
         if focal <= 0:
-            raise InputError(
-                f"{where}: fl_{axis}", f"{focal:g} is not a focal length", "give positive pixels"
-            )
+            raise InputError(f"{where}: fl_{axis}", f"{focal:g} is not a focal length", "give positive pixels")
     return found.get("x", found.get("y", 0.0)), found.get("y", found.get("x", 0.0))

@@ -44,7 +44,5 @@ def load_new_photos(photos: Path, capture: Capture, *, warn: Warn = log_warning)
 def _unposed(folder: Path, give: str = _GIVE) -> InputError:
     count = sum(p.suffix.lower() in images.SUFFIXES for p in [*folder.glob("*"), *folder.glob("images/*")])
     if count:
-        return InputError(
-            folder, f"holds {count} photos but no camera poses, which are needed for now", f"give {give}"
-        )
+        return InputError(folder, f"holds {count} photos but no camera poses, which are needed for now", f"give {give}")
     return InputError(folder, "holds neither transforms.json nor a COLMAP model", f"give {give}")

@@ -54,9 +54,7 @@ def read_points(path: Path) -> Tensor:
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", "check the path") from None
     except (ValueError, KeyError, IndexError) as error:
-        raise InputError(
-            path, f"is not a usable point cloud ({error})", "write it as x y z PLY or remove it"
-        ) from None
+        raise InputError(path, f"is not a usable point cloud ({error})", "write it as x y z PLY or remove it") from None
     return torch.from_numpy(xyz)
 
 

@@ -134,9 +134,7 @@ def _read(path: Path) -> tuple[Path, dict[str, Any]]:
     data = read_json(json_path)
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise InputError(
-            f"{json_path}: frames", "no list of frames is given", "list the photos under 'frames'"
-        )
+        raise InputError(f"{json_path}: frames", "no list of frames is given", "list the photos under 'frames'")
     for i, entry in enumerate(frames):
         where = f"{json_path}: frames[{i}]"
         if not isinstance(entry, dict):
@@ -196,11 +194,7 @@ def _pose(entry: Entry, where: str) -> Tensor:
     rows = entry.get("transform_matrix")
     if rows is None:
         raise InputError(where, "is missing", "add the camera-to-world matrix (OpenGL camera axes)")
-    if not (
-        isinstance(rows, list)
-        and len(rows) in (3, 4)
-        and all(isinstance(r, list) and len(r) == 4 for r in rows)
-    ):
+    if not (isinstance(rows, list) and len(rows) in (3, 4) and all(isinstance(r, list) and len(r) == 4 for r in rows)):
         raise InputError(where, "is not a 4x4 or 3x4 matrix", "write it as a list of rows")
     numbers = [[number({"entry": v}, "entry", where, None) for v in row] for row in rows]
     matrix = torch.tensor(numbers + [[0.0, 0.0, 0.0, 1.0]] * (4 - len(rows)), dtype=torch.float64)
