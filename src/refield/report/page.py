@@ -18,10 +18,7 @@ _SCRIPT = (
     "document.querySelectorAll('.slide input').forEach(i=>"
     "i.addEventListener('input',()=>i.parentElement.style.setProperty('--at',i.value+'%')))"
 )
-_KEY = (
-    '<p class="lead"><span class="key in"></span>there now '
-    '&nbsp; <span class="key out"></span>no longer there</p>'
-)
+_KEY = '<p class="lead"><span class="key in"></span>there now &nbsp; <span class="key out"></span>no longer there</p>'
 
 
 def html_page(report: VisitReport) -> str:
@@ -87,9 +84,7 @@ def _photos(report: VisitReport) -> str:
     shown = _views([v for v in report.photos if v.name not in rejected], "new photo")
     if not rejected:
         return shown
-    items = "".join(
-        f"<li>{escape(n)}: {escape(why or 'no reason given')}</li>" for n, why in rejected.items()
-    )
+    items = "".join(f"<li>{escape(n)}: {escape(why or 'no reason given')}</li>" for n, why in rejected.items())
     return f'{shown}<div class="card warn"><h3>Rejected</h3><ul class="notes">{items}</ul></div>'
 
 

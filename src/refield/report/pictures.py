@@ -28,9 +28,7 @@ def data_uri(image: Tensor) -> str:
     """A picture (H, W, 3), uint8 or float in [0, 1], as text for an ``img``'s ``src``."""
     picture = _picture(image)
     if picture.width > WIDEST:
-        picture = picture.resize(
-            (WIDEST, round(picture.height * WIDEST / picture.width)), Image.Resampling.LANCZOS
-        )
+        picture = picture.resize((WIDEST, round(picture.height * WIDEST / picture.width)), Image.Resampling.LANCZOS)
     kind = "PNG" if picture.width * picture.height <= _PNG_PIXELS else "JPEG"
     buffer = io.BytesIO()
     picture.save(buffer, kind, **({"optimize": True} if kind == "PNG" else {"quality": 90}))
@@ -66,7 +64,7 @@ def write_contact_sheet(path: Path | str, views: Sequence[Comparison], height: i
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(13)
     x = _GAP
-    for i, caption in enumerate(("before", "new photo", "updated")):
+    for i, caption in enumerate(("before", "photo", "updated")):
         draw.text((x, _CAPTION / 2 + 2), caption, fill=(60, 60, 67), font=font, anchor="lm")
         for j, row in enumerate(complete):
             sheet.paste(row[i], (x, _CAPTION + _GAP // 2 + j * (height + _GAP)))

@@ -51,7 +51,7 @@ def _object_row(index: int, o: ObjectChange) -> str:
         about = f" <small>about ({', '.join(f'{v:.2f}' for v in axis)})</small>" if any(axis) else ""
         turned = f"{angle:.2f}°{about}"
     if sure is not None:
-        spread = f"{_number(sure[0])}, {sure[1]:.2f}°"
+        spread = f"{_number(sure[0])}, {f'{sure[1]:.2f}°' if sure[1] < 180 else 'any turn'}"
     cells = (f'<span class="kind {o.kind}">{o.kind}</span>', moved, turned, spread, f"{o.confidence:.2f}")
     return f"<tr><td>{index}</td>{''.join(f'<td>{c}</td>' for c in cells)}<td>{escape(o.note)}</td></tr>"
 
@@ -99,9 +99,7 @@ def bars(seconds: Mapping[str, float]) -> str:
 def _table(heads: Sequence[str], rows: str, numeric_from: int = 99) -> str:
     style = ' class="n"'
     cells = "".join(f"<th{style if i >= numeric_from else ''}>{escape(h)}</th>" for i, h in enumerate(heads))
-    return (
-        f'<div class="card scroll"><table><thead><tr>{cells}</tr></thead><tbody>{rows}</tbody></table></div>'
-    )
+    return f'<div class="card scroll"><table><thead><tr>{cells}</tr></thead><tbody>{rows}</tbody></table></div>'
 
 
 def _told(value: str | int | float) -> str:
