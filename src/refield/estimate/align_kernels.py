@@ -8,13 +8,14 @@ k1 k2 p1 p2 k3, height, width, and its centre in the world's first two free slot
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-_F32 = NDArray[np.float32]
-_F64 = NDArray[np.float64]
+_F32 = NDArray[Any]
+_F64 = NDArray[Any]
 
 
 @njit(cache=True, fastmath=True)
@@ -137,8 +138,17 @@ def _step(
 
 @njit(cache=True, fastmath=True)
 def _score(
-    points: _F64, colours: _F32, lenses: _F64, images: _F32, depths: _F32, targets: _F32, r: _F64, c: _F64,
-    cap: float, radius: float, block: int,
+    points: _F64,
+    colours: _F32,
+    lenses: _F64,
+    images: _F32,
+    depths: _F32,
+    targets: _F32,
+    r: _F64,
+    c: _F64,
+    cap: float,
+    radius: float,
+    block: int,
 ) -> float:
     """Mean capped colour error of the visible points plus the part of the target pixels that stay uncovered."""
     error, total, uncovered, wanted = 0.0, 0.0, 0.0, 0.0
@@ -184,8 +194,19 @@ def _score(
 
 @njit(cache=True, parallel=True, fastmath=True)
 def register_all(
-    points: _F64, colours: _F32, lenses: _F64, images: _F32, depths: _F32, targets: _F32, rotations: _F64,
-    centres: _F64, steps: int, scale: float, cap: float, radius: float, block: int,
+    points: _F64,
+    colours: _F32,
+    lenses: _F64,
+    images: _F32,
+    depths: _F32,
+    targets: _F32,
+    rotations: _F64,
+    centres: _F64,
+    steps: int,
+    scale: float,
+    cap: float,
+    radius: float,
+    block: int,
 ) -> _F64:
     """Improve K poses by ``steps`` steps each and score them: rotations (K, 3, 3), centres (K, 3) in place -> (K,)."""
     out = np.zeros(rotations.shape[0])
@@ -193,7 +214,5 @@ def register_all(
         for _ in range(steps):
             if not _step(points, colours, lenses, images, depths, rotations[k], centres[k], scale, radius):
                 break
-        out[k] = _score(
-            points, colours, lenses, images, depths, targets, rotations[k], centres[k], cap, radius, block
-        )
+        out[k] = _score(points, colours, lenses, images, depths, targets, rotations[k], centres[k], cap, radius, block)
     return out

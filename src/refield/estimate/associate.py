@@ -7,17 +7,21 @@ next is looked for. So two newcomers whose hulls run together are told apart by 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
+from scipy import ndimage
 from torch import Tensor
 
-from refield.estimate.detect import Mask
-from refield.estimate.hull import Hull, HullConfig, votes
+from refield.estimate.detect import Changed, DetectConfig, Mask
+from refield.estimate.hull import Hull, HullConfig, Plane, votes
 from refield.estimate.lattice import Lattice, Voxels, components, grown
+from refield.estimate.light import even_and_grey, log_ratio
 from refield.estimate.look import Array, View
+from refield.estimate.matched import matched_poses
 from refield.estimate.objects import Old
-from refield.estimate.past import Past
+from refield.estimate.past import Past, changed_share, gone_score, look_past
 from refield.estimate.pose_change import PoseChange, RefineConfig, object_alone, refine, refiner
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
 from refield.field.radiance import Field
@@ -27,29 +31,106 @@ from refield.vision import pixels
 
 @dataclass(frozen=True)
 class AssociateConfig:
-    """When a pose is believed."""
+    """When a pose, a departure, an arrival is believed."""
 
+    touched: float = 0.5
+    """part of an old object's pixels that must have changed for it to be looked for elsewhere"""
     fits: float = 0.62
     """worst registration score that is refined"""
     explains: float = 0.5
     """part of the object's pixels that the moved object must explain"""
     gains: float = 0.15
     """by how much more than the old rendering did"""
-    try_refined: int = 2
-    """candidates a pair that are refined"""
+    refined: int = 2
+    """candidates of an object that are refined"""
+    gone: float = 0.45
+    """part of an object's pixels that must show what was behind it, for it to have left"""
+    arrived: float = 0.5
+    """part of a newcomer's pixels that nothing else explains"""
+    still: float = 1.2
+    """pixels; what moved by less stayed"""
+    most: int = 5
+    """old objects, and places, that are tried; the largest first"""
 
 
 @dataclass(frozen=True)
-class Placed:
-    """An old object found at its new place."""
+class Ground:
+    """What every attempt shares."""
 
-    index: int
-    """which old object"""
-    change: PoseChange
+    field: Field
+    hull: Hull
+    free: Voxels
+    """voxels on the hull's lattice in front of whatever holds things up"""
+    up: Array
+    """(3,) the support's normal"""
+    planes: Sequence[Plane]
+    """what holds things up"""
+    survey: Sequence[View]
+    detect: DetectConfig
+    carving: HullConfig
+    believe: AssociateConfig
+    search: RegisterConfig
+    fine: RefineConfig
 
 
-def arrivals(hull: Hull, past: Sequence[Past], olds: Sequence[Old], allowed: Voxels, config: HullConfig) -> Voxels:
+@dataclass(frozen=True)
+class Settled:
+    """What became of everything that changed."""
+
+    moved: dict[int, PoseChange] = field(default_factory=dict)
+    """by index of the old object"""
+    removed: dict[int, float] = field(default_factory=dict)
+    """by index of the old object: part of its pixels that show what was behind"""
+    arrived: tuple[Voxels, ...] = ()
+    views: tuple[Past, ...] = ()
+
+
+def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> Settled:
+    """Find each old object's new place or that it left, and what else arrived."""
+    touched = [k for k, old in enumerate(olds) if changed_share(changed, old) >= ground.believe.touched]
+    views = look_past(ground.field, changed, ground.survey, [olds[k] for k in touched], ground.detect)
+    moved, views = _place_all(ground, {k: olds[k] for k in touched}, views)
+    removed = {}
+    for k in touched:
+        if k not in moved:
+            share, asked = gone_score(views, olds[k])
+            if share >= ground.believe.gone and asked >= 12:
+                removed[k] = share
+    kept = [k for k in touched if k in moved or k in removed]
+    if len(kept) < len(touched):  # what never left hides what is behind it after all
+        views = look_past(ground.field, changed, ground.survey, [olds[k] for k in kept], ground.detect)
+        for k, change in moved.items():
+            views = take_off(ground.field, views, olds[k], change)
+    gone = [olds[k] for k in kept]
+    arrived = newcomers(ground, arrivals(ground, views, gone), views)
+    moved = {k: c for k, c in moved.items() if _noticeable(olds[k], c, ground.believe.still)}
+    return Settled(moved, removed, tuple(arrived), tuple(views))
+
+
+def _place_all(ground: Ground, olds: dict[int, Old], views: list[Past]) -> tuple[dict[int, PoseChange], list[Past]]:
+    """Place the old objects that fit somewhere, the best first, taking each off the photos."""
+    moved: dict[int, PoseChange] = {}
+    guesses = {k: matched_poses(old, views, ground.survey) for k, old in list(olds.items())[: ground.believe.most]}
+    everyone = list(olds.values())
+    while True:
+        parts = newcomers(ground, arrivals(ground, views, everyone), views)[: ground.believe.most]
+        targets = [t for p in parts for t in targets_of(views, ground.hull.lattice, p)]
+        fits = {
+            k: best_fit(ground, olds[k], everyone, views, targets, extra)
+            for k, extra in guesses.items()
+            if k not in moved and targets
+        }
+        sure = [(score, k, change) for k, (score, change) in fits.items() if change is not None]
+        if not sure:
+            return moved, views
+        _, k, change = min(sure, key=lambda s: s[0])
+        moved[k] = change
+        views = take_off(ground.field, views, olds[k], change)
+
+
+def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> Voxels:
     """Voxels that newcomers may fill: in every seeing view's unexplained change, and empty once the old are gone."""
+    hull, config = ground.hull, ground.carving
     points = hull.lattice.centres.reshape(-1, 3)
     seen = [(replace(p.view, depth=p.depth), p.changed.mask & ~p.explained) for p in past]
     inside, against = votes(points, [(v, pixels.dilate(m, config.margin)) for v, m in seen], config)
@@ -59,7 +140,42 @@ def arrivals(hull: Hull, past: Sequence[Past], olds: Sequence[Old], allowed: Vox
         air |= old.lattice.holds(grown(old.voxels, 1), points)
     needed = min(2, len(past))
     found = (inside >= needed) & (sure >= needed) & (against == 0) & air
-    return found.reshape(hull.lattice.shape) & allowed
+    return found.reshape(hull.lattice.shape) & ground.free
+
+
+def newcomers(ground: Ground, voxels: Voxels, past: Sequence[Past]) -> list[Voxels]:
+    """Components of the arrivals that explain changed pixels which nothing else does."""
+    lattice = ground.hull.lattice
+    core = ndimage.binary_erosion(voxels, np.ones((3, 3, 3), bool))  # not the thin sheets left between masks
+    thick = grown(core, 2, voxels) if core.any() else core
+    out: list[Voxels] = []
+    taken = [~p.open for p in past]
+    for part in components(thick, ground.carving.smallest):
+        shares = []
+        shadows = [shadow_of(p.view, lattice, part) for p in past]
+        for here, gone in zip(shadows, taken):
+            if (here & ~gone).sum() >= ground.detect.smallest * here.size * 2:
+                shares.append(float((here & ~gone).sum() / here.sum()))
+        enough = len(shares) >= min(2, len(past)) and float(np.median(shares)) > ground.believe.arrived
+        if enough and not _only_light(ground, part, past):
+            out.append(part)
+            taken = [t | pixels.dilate(s, 1) for t, s in zip(taken, shadows)]
+    return out
+
+
+def _only_light(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
+    """Whether a would-be newcomer lies flat on what holds things up and only darkens or brightens it."""
+    points = ground.hull.lattice.centres[part]
+    extent = float((points.max(0) - points.min(0)).max())
+    heights = [float(np.quantile(plane.height(points), 0.95)) for plane in ground.planes]
+    if not heights or min(heights) > max(5 * ground.hull.lattice.cell, 0.3 * extent):
+        return False
+    alike, shown = 0, 0
+    for p in past:
+        here = shadow_of(p.view, ground.hull.lattice, part) & p.open
+        alike += int((here & even_and_grey(log_ratio(p.view, p.rgb, ground.detect), ground.detect)).sum())
+        shown += int(here.sum())
+    return alike > 0.5 * shown
 
 
 def shadow_of(view: View, lattice: Lattice, voxels: Voxels) -> Mask:
@@ -71,31 +187,39 @@ def shadow_of(view: View, lattice: Lattice, voxels: Voxels) -> Mask:
     return pixels.close(out, 5)
 
 
-def target_of(past: Sequence[Past], lattice: Lattice, voxels: Voxels) -> Target:
-    """A component of the arrivals as a place to register an object to."""
+def targets_of(past: Sequence[Past], lattice: Lattice, voxels: Voxels) -> list[Target]:
+    """A component of the arrivals as places to register an object to: its middle, and where its bulk is thickest."""
     wanted = []
     for p in past:
         here = shadow_of(p.view, lattice, voxels)
-        never = ~pixels.dilate(p.changed.mask | p.changed.light, 3)
+        never = ~pixels.dilate(p.changed.mask | p.changed.light | p.covered, 3)
         wanted.append(np.where(p.open & here, 1.0, 0.0).astype(np.float32) - never.astype(np.float32))
-    return Target(lattice.centres[voxels].mean(0), tuple(wanted))
+    middle = lattice.centres[voxels].mean(0)
+    inner = ndimage.distance_transform_edt(voxels)
+    bulk = lattice.centres[inner > 0.7 * inner.max()].mean(0)
+    centres = [middle] if np.linalg.norm(bulk - middle) < 4 * lattice.cell else [middle, bulk]
+    return [Target(c.astype(np.float32), tuple(wanted)) for c in centres]
 
 
 def best_fit(
-    field: Field, old: Old, olds: Sequence[Old], past: Sequence[Past], targets: Sequence[Target], up: Array,
-    configs: tuple[AssociateConfig, RegisterConfig, RefineConfig], extra: Sequence[Tensor] = (),
+    ground: Ground,
+    old: Old,
+    olds: Sequence[Old],
+    past: Sequence[Past],
+    targets: Sequence[Target],
+    extra: Sequence[Tensor] = (),
 ) -> tuple[float, PoseChange | None]:
     """The pose change that best explains the photos with one old object, and its registration score."""
-    believe, search, fine = configs
+    believe = ground.believe
     found: list[Candidate] = []
     for target in targets:
-        found += register(old.cloud, past, target, up, search, extra)
+        found += register(old.cloud, past, target, ground.up, ground.search, extra)
     found.sort(key=lambda c: c.score)
     best: PoseChange | None = None
-    for candidate in found[: believe.try_refined]:
-        if candidate.score > believe.fits or (best is not None and candidate.score > found[0].score + 0.15):
+    for candidate in found[: believe.refined]:
+        if candidate.score > min(believe.fits, found[0].score + 0.1):
             break
-        ready = refiner(field, old, past, olds, candidate.new_from_old, fine)
+        ready = refiner(ground.field, old, past, olds, candidate.new_from_old, ground.fine)
         if not ready.crops:
             continue
         change = refine(ready, candidate.new_from_old)
@@ -111,41 +235,18 @@ def take_off(field: Field, past: Sequence[Past], old: Old, change: PoseChange) -
     out = []
     for p in past:
         view = p.view
-        _, depth, opacity = object_alone(field, old.grid(), view.rays, change.new_from_old, 56)
+        _, depth, opacity = object_alone(field, old.grid(), view.rays, change.new_from_old)
         shown = ((opacity > 0.5).numpy() & (depth.numpy() <= p.depth.ravel() + 0.5 * old.radius)).reshape(view.shape)
         shown = pixels.dilate(shown, 2)
         mask = p.changed.mask & ~shown
         front = np.where(shown, np.minimum(p.depth, depth.numpy().reshape(view.shape)), p.depth)
-        out.append(replace(p, changed=replace(p.changed, mask=mask), depth=front))
+        changed = replace(p.changed, mask=mask)
+        out.append(replace(p, changed=changed, depth=front.astype(np.float32), covered=p.covered | shown))
     return out
 
 
-def moved_noticeably(old: Old, change: PoseChange, pixel: float) -> bool:
-    """Whether any part of the object moved by more than about a pixel."""
-    points = old.cloud.points.astype(np.float64)
-    import torch
-
-    moved = transform(change.new_from_old, torch.from_numpy(points)).numpy()
-    return bool(np.linalg.norm(moved - points, axis=-1).max() > 1.2 * pixel)
-
-
-def newcomers(voxels: Voxels, past: Sequence[Past], lattice: Lattice, config: HullConfig) -> list[Voxels]:
-    """Components of the arrivals that explain changed pixels which nothing else does."""
-    out = []
-    thick = grown(components_core(voxels), 2, voxels) if voxels.any() else voxels
-    for part in components(thick, config.smallest):
-        shares = []
-        for p in past:
-            here = shadow_of(p.view, lattice, part) & p.known
-            if here.sum() >= 6:
-                shares.append(float((here & p.open).sum() / here.sum()))
-        if len(shares) >= min(2, len(past)) and float(np.median(shares)) > 0.6:
-            out.append(part)
-    return out
-
-
-def components_core(voxels: Voxels) -> Voxels:
-    """Voxels that survive an erosion: thin sheets left between masks do not."""
-    from scipy import ndimage
-
-    return ndimage.binary_erosion(voxels, np.ones((3, 3, 3), bool), iterations=1)
+def _noticeable(old: Old, change: PoseChange, still: float) -> bool:
+    """Whether any part of the object moved by more than ``still`` pixels."""
+    points = torch.from_numpy(old.cloud.points).double()
+    shift = (transform(change.new_from_old, points) - points).norm(dim=-1)
+    return bool(shift.max() > still * change.pixel)

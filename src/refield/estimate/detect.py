@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from refield.estimate.look import Array, View
 from refield.vision import pixels
 
-Mask = NDArray[np.bool_]
+Mask = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def difference(view: View, config: DetectConfig) -> Array:
 def noise_at(view: View, survey: Sequence[Changed]) -> Array:
     """What the old photos' differences are at the surface under each pixel, (H, W): their mean where visible."""
     points = view.surface.reshape(-1, 3)
-    finite = np.isfinite(points).all(-1)
+    finite = np.all(np.isfinite(points), axis=-1)
     points = np.where(finite[:, None], points, 0)
     total, count = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
     for old in survey:

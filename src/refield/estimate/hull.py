@@ -124,9 +124,7 @@ def _points_before_surface(c: Changed, config: HullConfig, at_most: int = 2500) 
     return (c.view.centre + d[:, None] * (reach[:, None] * t)[..., None]).reshape(-1, 3).astype(np.float32)
 
 
-def carve(
-    lattice: Lattice, seen: Sequence[tuple[View, Mask]], old: Sequence[View], config: HullConfig
-) -> Hull:
+def carve(lattice: Lattice, seen: Sequence[tuple[View, Mask]], old: Sequence[View], config: HullConfig) -> Hull:
     """The hull on a lattice, from the new views' masks and the old renderings."""
     points = lattice.centres.reshape(-1, 3)
     inside, against = votes(points, [(v, pixels.dilate(m, config.margin)) for v, m in seen], config)

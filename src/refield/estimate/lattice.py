@@ -41,12 +41,12 @@ class Lattice:
         axes = [self.low[a] + self.cell * np.arange(self.shape[a]) for a in range(3)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), -1).astype(np.float32)
 
-    def index(self, points: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def index(self, points: Array) -> tuple[Array, Array]:
         """Voxel of each point (N, 3) -> (N, 3), and whether it lies in the lattice."""
         with np.errstate(invalid="ignore"):
             ijk = np.nan_to_num(np.round((points - self.low) / self.cell), nan=-1, posinf=-1, neginf=-1)
         ijk = np.clip(ijk, -1, max(self.shape)).astype(np.int64)
-        inside = ((ijk >= 0) & (ijk < np.array(self.shape))).all(-1)
+        inside = np.all((ijk >= 0) & (ijk < np.array(self.shape)), axis=-1)
         return np.where(inside[..., None], ijk, 0), inside
 
     def holds(self, voxels: Voxels, points: Array) -> NDArray[np.bool_]:

@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 
 from refield.estimate.detect import Changed, DetectConfig, Mask, blur_sigma
-from refield.estimate.look import Array
+from refield.estimate.hull import Plane
+from refield.estimate.look import Array, View
 from refield.vision import pixels
 
 _DARK = 0.03  # linear light; below it a ratio is noise
@@ -21,38 +22,50 @@ _AGREE = 0.12  # log units between two views' ratios of the same surface point
 _SAME_PLACE = 0.02  # of the distance
 
 
-def set_light_aside(changed: Sequence[Changed], config: DetectConfig) -> list[Changed]:
-    """The same views with the light changes moved from ``mask`` to ``light``."""
-    ratios = [log_ratio(c, config) for c in changed]
+def set_light_aside(changed: Sequence[Changed], planes: Sequence[Plane], config: DetectConfig) -> list[Changed]:
+    """The same views with the light changes moved from ``mask`` to ``light``.
+
+    On a support plane one other view that sees the same ratio at the same point is enough, if none shows that point
+    unchanged; elsewhere most of the views must, since an object's own side can look like a shadow.
+    """
+    ratios = [log_ratio(c.view, c.view.rgb, config) for c in changed]
     out = []
     for i, c in enumerate(changed):
-        agrees, asked = _agreement(i, changed, ratios)
-        even = _even_and_grey(ratios[i], config)
-        light = c.mask & even & (agrees >= np.maximum(1, 0.6 * asked))
-        light = cv2.medianBlur(light.astype(np.uint8), 5).astype(bool)
-        light &= c.mask
+        agrees, denies, asked = _agreement(i, changed, ratios)
+        flat = _on_planes(c.view, planes) & (denies == 0) & (agrees >= 1)
+        light = c.mask & even_and_grey(ratios[i], config) & (flat | (agrees >= np.maximum(2, 0.6 * asked)))
+        light = cv2.medianBlur(light.astype(np.uint8), 5).astype(bool) & c.mask
         smallest = max(6, config.smallest * light.size)
-        light = pixels.keep_components(light, 2 * smallest)
+        rest = c.mask & ~pixels.keep_components(light, 2 * smallest)
         # the rim of a shadow is neither even nor quite grey: give it to the shadow it touches
-        rest = c.mask & ~light
         core = pixels.keep_components(pixels.dilate(pixels.erode(rest, 1), 1) & rest, smallest)
-        light = c.mask & ~core
-        out.append(replace(c, mask=core, light=light) if light.any() else c)
+        out.append(replace(c, mask=core, light=c.mask & ~core))
     return out
 
 
-def log_ratio(c: Changed, config: DetectConfig) -> Array:
-    """log(photo / field) per channel in linear light, (H, W, 3)."""
-    sigma = blur_sigma(c.view, config)
-    photo, rgb = (pixels.blur(_linear(im), sigma) for im in (c.view.photo, c.view.rgb))
-    return np.log((photo + _DARK / 3) / (rgb + _DARK / 3)).astype(np.float32)
+def _on_planes(view: View, planes: Sequence[Plane]) -> Mask:
+    """Pixels whose surface lies on one of the planes."""
+    points = np.nan_to_num(view.surface, posinf=1e9, neginf=-1e9)
+    slack = 2 * view.pixel_angle * np.nan_to_num(view.depth, posinf=0)
+    out = np.zeros(view.shape, bool)
+    for plane in planes:
+        out |= np.abs(plane.height(points)) < np.maximum(slack, 3 * plane.noise)
+    return out
+
+
+def log_ratio(view: View, rgb: Array, config: DetectConfig) -> Array:
+    """log(photo / rgb) per channel in linear light, (H, W, 3); ``rgb`` is what the field shows, (H, W, 3)."""
+    sigma = blur_sigma(view, config)
+    photo, shown = (pixels.blur(_linear(im), sigma) for im in (view.photo, rgb))
+    return np.log((photo + _DARK / 3) / (shown + _DARK / 3)).astype(np.float32)
 
 
 def _linear(image: Array) -> Array:
     return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-def _even_and_grey(ratio: Array, config: DetectConfig) -> Mask:
+def even_and_grey(ratio: Array, config: DetectConfig) -> Mask:
+    """Pixels whose ratio (H, W, 3) is near grey, much the same around, and within reason."""
     mean = ratio.mean(-1)
     chroma = np.abs(ratio - mean[..., None]).max(-1)
     spread = cv2.blur(mean**2, (3, 3)) - cv2.blur(mean, (3, 3)) ** 2
@@ -60,13 +73,13 @@ def _even_and_grey(ratio: Array, config: DetectConfig) -> Mask:
     return even & (chroma < config.grey + 0.15 * np.abs(mean)) & (np.abs(mean) < np.log(config.largest_ratio))
 
 
-def _agreement(i: int, changed: Sequence[Changed], ratios: Sequence[Array]) -> tuple[Array, Array]:
-    """How many other views see the same ratio at the surface under each pixel, and how many see that surface."""
+def _agreement(i: int, changed: Sequence[Changed], ratios: Sequence[Array]) -> tuple[Array, Array, Array]:
+    """How many other views, at the surface under each pixel, see the same ratio; see no change; see that surface."""
     view = changed[i].view
     points = view.surface.reshape(-1, 3)
     ok = np.isfinite(points).all(-1) & changed[i].mask.ravel()
     points = np.where(ok[:, None], points, 0)
-    agrees, asked = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
+    agrees, denies, asked = (np.zeros(len(points), np.float32) for _ in range(3))
     own = ratios[i].reshape(-1, 3)
     for k, other in enumerate(changed):
         if k == i:
@@ -75,6 +88,8 @@ def _agreement(i: int, changed: Sequence[Changed], ratios: Sequence[Array]) -> t
         front = other.view.lookup(other.view.depth, uv, inside)
         visible = ok & inside & (np.abs(front - distance) < _SAME_PLACE * distance)
         same = np.abs(other.view.lookup(ratios[k], uv, inside) - own).max(-1) < _AGREE
+        touched = other.view.lookup(pixels.dilate(other.mask, 1), uv, inside)
         asked += visible
         agrees += visible & same
-    return agrees.reshape(view.shape), asked.reshape(view.shape)
+        denies += visible & ~touched
+    return agrees.reshape(view.shape), denies.reshape(view.shape), asked.reshape(view.shape)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.field.radiance import Field
+from refield.field.render import visible_samples
 from refield.field.volrend import Samples, composite, weights
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
@@ -24,7 +26,7 @@ from refield.scene.images import frame_image
 
 Hidden = Callable[[Tensor], Tensor]
 """World points (S, 3) -> (S,) bool: samples to leave out."""
-Array = NDArray[np.float32]
+Array = NDArray[Any]
 
 _CHUNK = 8192
 _NEGLIGIBLE = 1e-3  # weight of a sample whose colour is not asked for; the sum of what is lost stays below a grey level
@@ -52,7 +54,8 @@ def see(field: Field, rays: Rays, hidden: Hidden | None = None) -> Seen:
 
 
 def _see(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
-    samples = field.sampler(rays)
+    # what is hidden may uncover what the field's own choice of samples leaves out
+    samples = visible_samples(field, rays) if hidden is None else field.sampler(rays)
     x, d = samples.positions(rays)
     sigmas = field.density(x)
     if hidden is not None:
@@ -137,7 +140,7 @@ class View:
         """Width of a pixel in radians, at the middle of the image."""
         return 1.0 / self.camera.fx
 
-    def project(self, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def project(self, points: Array) -> tuple[Array, Array, Array]:
         """World (..., 3) -> pixels (..., 2), distances (...,) along the ray, and whether inside the image."""
         m = self.frame.world_from_cam
         x = torch.from_numpy(np.ascontiguousarray(points, np.float32))
@@ -147,7 +150,7 @@ class View:
         inside = (z > 1e-6) & (uv >= 0).all(-1) & (uv[..., 0] < w) & (uv[..., 1] < h)
         return uv.numpy(), local.norm(dim=-1).numpy(), inside.numpy()
 
-    def lookup(self, image: NDArray[np.generic], uv: Array, inside: NDArray[np.bool_]) -> NDArray[np.generic]:
+    def lookup(self, image: Array, uv: Array, inside: Array) -> Array:
         """Nearest pixel's value at ``uv`` (..., 2); that of pixel (0, 0) outside the image."""
         j = np.where(inside, uv[..., 0], 0).astype(np.int64)
         i = np.where(inside, uv[..., 1], 0).astype(np.int64)

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import ndimage
+from torch import Tensor
 
 from refield.estimate.hull import Plane
 from refield.estimate.lattice import Lattice, Voxels, components, grown
@@ -27,11 +27,11 @@ from refield.scene.change import OccupancyGrid
 class ObjectConfig:
     """How an object's shape is found."""
 
-    longest: int = 72
+    longest: int = 64
     """voxels along the longest side of the box around the object"""
     box: float = 1.6
     """size of that box relative to the changed part"""
-    rays: int = 90_000
+    rays: int = 60_000
     """looked along, over all old views together"""
     through: float = 0.05
     """a voxel is empty if more than this part of the old views that look at it look through it"""
@@ -87,10 +87,12 @@ class Old:
 
     lattice: Lattice
     voxels: Voxels
-    seen: Voxels
-    """voxels that at least one old view looks at"""
+    free: Voxels
+    """voxels in front of what holds things up"""
     cloud: Cloud
     patches: tuple[Patch, ...]
+    margin: int = 2
+    """voxels between its surface (the field's median depth) and where the field's soft surface ends"""
 
     @property
     def centre(self) -> Array:
@@ -107,13 +109,14 @@ class Old:
         return float(self.voxels.sum()) * self.lattice.cell**3
 
     def grid(self) -> OccupancyGrid:
-        """Its mask M: a little smoothed, so that the trilinear half level is not a staircase."""
-        values = ndimage.gaussian_filter(self.voxels.astype(np.float32), 0.7)
+        """Its mask M: with the whole of the field's soft surface, which is as thick as its samples are apart, and a
+        little smoothed, so that the trilinear half level is not a staircase."""
+        values = ndimage.gaussian_filter((grown(self.voxels, self.margin) & self.free).astype(np.float32), 0.7)
         return self.lattice.grid(values)
 
-    def hidden(self, margin: int = 1) -> Hidden:
-        """Whether points belong to the object, for looking past it."""
-        grid = self.lattice.grid(grown(self.voxels, margin).astype(np.float32))
+    def hidden(self, margin: int = 3) -> Hidden:
+        """Whether points belong to the object or the haze around it, for looking past it."""
+        grid = self.lattice.grid((grown(self.voxels, margin) & self.free).astype(np.float32))
         return grid.contains
 
 
@@ -167,25 +170,30 @@ def look_around(field: Field, frames: Sequence[Frame], corners: Array, rays: int
     return out
 
 
-def carve_solid(lattice: Lattice, patches: Sequence[Patch], through: float) -> tuple[Voxels, Voxels]:
-    """Voxels that the old views do not look through, and those that at least one looks at."""
-    points = torch.from_numpy(lattice.centres.reshape(-1, 3)).double()
-    looked, passed = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
-    for p in patches:
-        m = p.frame.world_from_cam
-        local = (points - m[:3, 3]) @ m[:3, :3]
-        uv, z = p.camera.project(local)
-        j, i = uv[:, 0].floor().long().numpy() - p.box[0], uv[:, 1].floor().long().numpy() - p.box[1]
-        h, w = p.depth.shape
-        inside = (z.numpy() > 0) & (i >= 0) & (i < h) & (j >= 0) & (j < w)
-        front = p.depth[np.where(inside, i, 0), np.where(inside, j, 0)]
-        distance = local.norm(dim=-1).numpy()
-        slack = 0.75 * lattice.cell
-        looked += inside & (distance < front + slack)
-        passed += inside & (distance < front - slack)
-    covered = sum(1 for _ in patches)
-    solid = passed <= max(0.0, through * min(covered, 1e9))
-    return solid.reshape(lattice.shape), (looked > 0).reshape(lattice.shape)
+def carve_solid(lattice: Lattice, patches: Sequence[Patch], through: float) -> Voxels:
+    """Voxels that at most the part ``through`` of the old views look through (§10.2.4's projection check)."""
+    points = torch.from_numpy(lattice.centres.reshape(-1, 3))
+    left = torch.arange(len(points))
+    passed = torch.zeros(len(points), dtype=torch.int16)
+    order = np.random.default_rng(0).permutation(len(patches))
+    for k in order:  # views that differ most come soon, so that air is dropped early
+        passed[left] += _looks_through(patches[k], points[left], 0.75 * lattice.cell).to(torch.int16)
+        left = left[passed[left] <= through * len(patches)]
+    solid = np.zeros(len(points), bool)
+    solid[left.numpy()] = True
+    return solid.reshape(lattice.shape)
+
+
+def _looks_through(p: Patch, points: Tensor, slack: float) -> Tensor:
+    m = p.frame.world_from_cam
+    local = (points - m[:3, 3].float()) @ m[:3, :3].float()
+    uv, z = p.camera.project(local)
+    j, i = uv[:, 0].floor().long() - p.box[0], uv[:, 1].floor().long() - p.box[1]
+    h, w = p.depth.shape
+    inside = (z > 0) & (i >= 0) & (i < h) & (j >= 0) & (j < w)
+    at = torch.where(inside, i * w + j, torch.zeros_like(i))
+    front = torch.from_numpy(p.depth).reshape(-1)[at]
+    return inside & (local.norm(dim=-1) < front - slack)
 
 
 def surface_cloud(lattice: Lattice, voxels: Voxels, patches: Sequence[Patch], count: int) -> Cloud:
@@ -245,17 +253,22 @@ def outline(
     if not patches:
         return None
     lattice = Lattice.over(low, high, config.longest)
-    solid, seen = carve_solid(lattice, patches, config.through)
+    solid = carve_solid(lattice, patches, config.through)
+    free = np.ones(lattice.shape, bool)
     for plane in planes:
-        solid &= plane.height(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
+        free &= plane.height(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
+    solid &= free
     start = seeds[0].holds(grown(seeds[1], 1), lattice.centres) & solid
-    parts = [p for p in components(solid, 30) if (p & start).sum() > 0.3 * start.sum() or (p & start).sum() > 0.4 * p.sum()]
+    parts = [
+        p for p in components(solid, 30) if (p & start).sum() > 0.3 * start.sum() or (p & start).sum() > 0.4 * p.sum()
+    ]
     if not parts:
         return None
     voxels = np.logical_or.reduce(parts)
     voxels = ndimage.binary_fill_holes(voxels)
     cloud = surface_cloud(lattice, voxels, patches, config.points)
-    return Old(lattice, voxels, seen, cloud, tuple(patches)) if len(cloud.points) >= 30 else None
+    margin = int(np.clip(round(field.sampler.step / lattice.cell), 1, 4))
+    return Old(lattice, voxels, free, cloud, tuple(patches), margin) if len(cloud.points) >= 30 else None
 
 
 def restricted(old: Old, voxels: Voxels, config: ObjectConfig) -> Old:

@@ -38,6 +38,8 @@ class Past:
     """pixels at which what is behind was seen by some old photo (everywhere outside ``was``)"""
     difference: Array
     """(H, W) Lab difference of the photo and ``rgb``"""
+    covered: Mask
+    """pixels at which an object that was placed stands in front"""
 
     @property
     def view(self) -> View:
@@ -52,7 +54,8 @@ class Past:
     @property
     def open(self) -> Mask:
         """Changed pixels that something new must explain."""
-        return self.changed.mask & self.known & ~self.explained
+        left = self.changed.mask & self.known & ~self.explained
+        return pixels.dilate(pixels.erode(left, 1), 1) & left  # what is left at outlines is no wider than this
 
 
 def look_past(
@@ -62,9 +65,7 @@ def look_past(
     return [_look_past(field, c, survey, olds, config) for c in changed]
 
 
-def _look_past(
-    field: Field, c: Changed, survey: Sequence[View], olds: Sequence[Old], config: DetectConfig
-) -> Past:
+def _look_past(field: Field, c: Changed, survey: Sequence[View], olds: Sequence[Old], config: DetectConfig) -> Past:
     view = c.view
     was = np.zeros(view.shape, bool)
     for old in olds:
@@ -78,17 +79,19 @@ def _look_past(
         depth.reshape(-1)[index] = seen.depth.numpy()
     hit = np.abs(np.where(np.isfinite(depth), depth, 0) - np.where(np.isfinite(view.depth), view.depth, 0))
     gone = was & (hit > tolerance(view, np.where(np.isfinite(view.depth), view.depth, 0), HullConfig()))
-    known = ~was | (_seen_before(view, depth, survey) & ~_beneath(view, depth, olds))
+    gone = pixels.close(gone, 3)
+    guess = was & ~(_seen_before(view, depth, survey) & ~_beneath(view, depth, olds))
+    known = ~pixels.dilate(pixels.close(guess, 3), 1)
     sigma = blur_sigma(view, config)
     diff = pixels.colour_difference(pixels.blur(view.photo, sigma), pixels.blur(rgb, sigma), config.reach)
-    return Past(c, rgb, depth, gone, known, diff)
+    return Past(c, rgb, depth, gone, known, diff, np.zeros(view.shape, bool))
 
 
 def _seen_before(view: View, depth: Array, survey: Sequence[View]) -> Mask:
     """Pixels whose surface at ``depth`` some old view looks at."""
     with np.errstate(invalid="ignore"):
         points = (view.centre + view.directions * depth[..., None]).reshape(-1, 3)
-    finite = np.isfinite(points).all(-1)
+    finite = np.all(np.isfinite(points), axis=-1)
     points = np.where(finite[:, None], points, 0)
     count = np.zeros(len(points), np.int16)
     for old in survey:
@@ -121,17 +124,22 @@ def silhouette(view: View, old: Old) -> Mask:
 def gone_score(past: Sequence[Past], old: Old) -> tuple[float, int]:
     """How much better the photos agree with what is behind than with the object: (part of known pixels, pixels).
 
-    Only pixels are asked that show the object in the old field and whose background is known.
+    Only pixels are asked that show the object in the old field, whose background is known, and before which no object
+    that was placed stands.
     """
     better, asked = 0, 0
     for p in past:
-        here = silhouette(p.view, old) & p.was & p.known
-        stayed = p.changed.difference
+        here = silhouette(p.view, old) & p.was & p.known & ~p.covered
         asked += int(here.sum())
-        better += int((here & (p.difference < 0.7 * stayed) & p.changed.mask).sum())
+        better += int((here & (p.difference < 0.7 * p.changed.difference) & p.changed.mask).sum())
     return (better / asked if asked else 0.0), asked
 
 
-def silhouette_size(changed: Sequence[Changed], old: Old) -> int:
-    """Changed pixels that show the object, over all new views."""
-    return sum(int((silhouette(c.view, old) & c.mask).sum()) for c in changed)
+def changed_share(changed: Sequence[Changed], old: Old) -> float:
+    """Part of the pixels that show the object in the old field which changed, over all new views; 0 if too few do."""
+    shown, touched = 0, 0
+    for c in changed:
+        here = silhouette(c.view, old)
+        shown += int(here.sum())
+        touched += int((here & c.mask).sum())
+    return touched / shown if touched >= 12 else 0.0

@@ -16,7 +16,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from refield.estimate.look import Array, load_photo, see, shaded
+from refield.estimate.look import load_photo, see, shaded
 from refield.estimate.objects import Old, box_in, patch_rays
 from refield.estimate.past import Past
 from refield.field.radiance import Field
@@ -38,14 +38,18 @@ class RefineConfig:
     """pixels, coarse to fine"""
     steps: int = 6
     """Gauss–Newton steps at each blur (the paper: 500 of Adam)"""
+    grow: int = 2
+    """voxels around the object that are moved with it: a field's surface is a shell, not a sheet"""
     margin: int = 5
     """pixels around the object that are compared too"""
     outline: float = 0.2
     """weight of the pixels at and beyond the object's outline"""
+    shading: float = 0.35
+    """colour differences smoother than this part of the object's radius are put down to light"""
+    shaded: float = 0.8
+    """and taken off to this part; the rest holds objects without texture"""
     robust: float = 0.06
     """colour error, in [0, 1] RGB, beyond which a pixel counts less"""
-    steps_through: int = 56
-    """samples along the diagonal of the object's box"""
     unseen: float = 0.02
     """a turn is unobservable if the photos hold it this much less than a shift of the same size"""
 
@@ -66,6 +70,8 @@ class PoseChange:
     """the same for the old field's unchanged rendering"""
     pixels: int
     """visible pixels of the object, over all photos"""
+    pixel: float
+    """world size of a pixel at the object"""
     note: str = ""
 
 
@@ -127,6 +133,25 @@ class Linear:
 
 
 @dataclass(frozen=True)
+class _Even:
+    """Takes the smooth part off colour differences inside the object: an object that turned is lit differently."""
+
+    inner: Tensor
+    """(H, W) 1 well inside the object"""
+    sigma: float
+    share: float
+    """how much of the smooth part is taken off"""
+
+    def __call__(self, image: Tensor) -> Tensor:
+        h, w = self.inner.shape
+        inside = self.inner.numpy()
+        kept = image.reshape(h, w, 3).numpy() * inside[..., None]
+        total = pixels.blur(inside, self.sigma)
+        smooth = pixels.blur(kept, self.sigma) / np.maximum(total, 1e-3)[..., None]
+        return image - torch.from_numpy((self.share * smooth * inside[..., None]).reshape(-1, 3))
+
+
+@dataclass(frozen=True)
 class Refiner:
     """Composites of one object over the new photos, as a function of T."""
 
@@ -139,7 +164,12 @@ class Refiner:
 
     @cached_property
     def grid(self) -> OccupancyGrid:
-        return self.old.grid()
+        return self.old.grid(self.config.grow)
+
+    @property
+    def apparent(self) -> float:
+        """The object's radius in pixels."""
+        return self.old.radius / self.pixel
 
     @cached_property
     def centre(self) -> Tensor:
@@ -147,7 +177,7 @@ class Refiner:
 
     def show(self, crop: _Crop, new_from_old: Tensor) -> _Shown:
         """The moved object over the fixed background (Eqs. 1, 3)."""
-        seen, depth, opacity = object_alone(self.field, self.grid, crop.rays, new_from_old, self.config.steps_through)
+        seen, depth, opacity = object_alone(self.field, self.grid, crop.rays, new_from_old)
         front = ((crop.depth - depth) > -self.pixel * 2) & (opacity > 0.02)
         o = torch.where(front, opacity, torch.zeros_like(opacity))[:, None]
         rgb = torch.where(front[:, None], seen, torch.zeros_like(seen))
@@ -167,19 +197,24 @@ class Refiner:
         alpha = shown.opacity.reshape(crop.shape).numpy()
         inner = pixels.erode(alpha > 0.9, 1 + int(sigma > 1))
         weight = torch.from_numpy(np.where(inner, 1.0, self.config.outline).reshape(-1))
+        even = _Even(
+            torch.from_numpy(inner.astype(np.float32)), self.config.shading * self.apparent, self.config.shaded
+        )
+        e = even(e)
         if not slopes:
             return e, weight, zero[:, :1]
         flow = self._flow(crop, shown, transform(pose, self.centre)) * ok[..., None]
-        columns = [_blurred(flow[..., k], crop.shape, sigma) for k in range(6)]
+        columns = [even(_blurred(flow[..., k], crop.shape, sigma)) for k in range(6)]
         return e, weight, torch.stack(columns, -1)
 
     def _flow(self, crop: _Crop, shown: _Shown, centre: Tensor) -> Tensor:
         """How the composite changes with a twist about ``centre``, (n, 3, 6): its object layer slides over the image."""
         h, w = crop.shape
         alpha, layer = shown.opacity.reshape(h, w).numpy(), shown.layer.reshape(h, w, 3).numpy()
-        depth = shown.depth.reshape(h, w).numpy()
-        _, nearest = ndimage.distance_transform_edt(~((alpha > 0.5) & np.isfinite(depth)), return_indices=True)
-        depth = torch.from_numpy(depth[nearest[0], nearest[1]].reshape(-1)).double()
+        seen = shown.depth.reshape(h, w).numpy()
+        # beyond the outline the layer slides along with its nearest pixel
+        _, nearest = ndimage.distance_transform_edt(~((alpha > 0.5) & np.isfinite(seen)), return_indices=True)
+        depth = torch.from_numpy(seen[nearest[0], nearest[1]].reshape(-1)).double()
         depth = torch.where(torch.isfinite(depth), depth, torch.ones_like(depth))
         x = crop.rays.origins.double() + crop.rays.directions.double() * depth[:, None]
         per_point = _pixel_slopes(crop, x)
@@ -198,41 +233,50 @@ class Refiner:
         return shift @ step @ invert(shift) @ new_from_old
 
 
-def object_alone(
-    field: Field, grid: OccupancyGrid, rays: Rays, new_from_old: Tensor, through: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour (premultiplied), median depth and opacity of a moved object's own samples along rays."""
+def object_alone(field: Field, grid: OccupancyGrid, rays: Rays, new_from_old: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Colour (premultiplied), median depth and opacity of a moved object's own samples along rays.
+
+    The samples are where the field's own sampler has them: a field is only right at the spacing it was trained with.
+    """
     old_from_new = invert(new_from_old)
-    o, d = transform(old_from_new, rays.origins), rotate(old_from_new, rays.directions)
-    lo, hi = grid.tight_aabb()
-    inverse = 1 / torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
-    a, b = (lo - o) * inverse, (hi - o) * inverse
-    near, far = torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)
+    there = Rays(transform(old_from_new, rays.origins), rotate(old_from_new, rays.directions))
     n = len(rays)
     rgb, depth, opacity = torch.zeros(n, 3), torch.full((n,), torch.inf), torch.zeros(n)
+    near, far = crossing(grid, there)
     hit = (far > near).nonzero()[:, 0]
     if len(hit) == 0:
         return rgb, depth, opacity
-    step = float((hi - lo).norm()) / through
-    t = near[hit, None] + step * torch.arange(through + 1)
-    x = o[hit, None] + d[hit, None] * (t + step / 2)[..., None]
-    inside = (t < far[hit, None]) & field.sampler.occupied(x)
-    inside[inside.clone()] = grid.contains(x[inside])
-    counts = inside.sum(1)
+    there = there[hit]
+    samples = field.sampler(there)
+    ids = samples.ray_ids
+    middle = (samples.t_starts + samples.t_ends) / 2
+    keep = ((middle > near[hit][ids]) & (middle < far[hit][ids])).nonzero()[:, 0]
+    x = there.origins[ids[keep]] + there.directions[ids[keep]] * middle[keep, None]
+    inside = grid.contains(x)
+    keep, x = keep[inside], x[inside]
+    counts = torch.bincount(ids[keep], minlength=len(hit))
     offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-    starts = t[inside]
-    samples = Samples(starts, starts + step, offsets)
-    at = (x[inside], d[hit][samples.ray_ids])
+    own = Samples(samples.t_starts[keep], samples.t_ends[keep], offsets)
     with torch.no_grad():
-        seen = shaded(field, at, field.density(at[0]), samples)
+        seen = shaded(field, (x, there.directions[ids[keep]]), field.density(x), own)
     rgb[hit], depth[hit], opacity[hit] = seen.rgb, seen.depth, seen.opacity
     return rgb, depth, opacity
 
 
-def refiner(field: Field, old: Old, past: Sequence[Past], olds: Sequence[Old], start: Tensor, config: RefineConfig) -> Refiner:
+def crossing(grid: OccupancyGrid, rays: Rays) -> tuple[Tensor, Tensor]:
+    """Distances (N,) at which rays enter and leave a grid's tight box; a ray misses if it does not enter first."""
+    lo, hi = grid.tight_aabb()
+    d = rays.directions
+    inverse = 1 / torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
+    a, b = (lo - rays.origins) * inverse, (hi - rays.origins) * inverse
+    return torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)
+
+
+def refiner(
+    field: Field, old: Old, past: Sequence[Past], olds: Sequence[Old], start: Tensor, config: RefineConfig
+) -> Refiner:
     """Prepare the photos around the place where ``start`` puts the object."""
-    corners = old.grid().tight_aabb()
-    corners = transform(start, torch.cartesian_prod(*corners.T.double())).numpy()
+    corners = transform(start, torch.cartesian_prod(*old.grid().tight_aabb().T.double())).numpy()
     boxes = []
     for p in past:
         box = box_in(p.view.frame.camera, p.view.frame, corners, config.margin)
@@ -267,8 +311,15 @@ def _crop(field: Field, p: Past, olds: Sequence[Old], camera: Camera, box: tuple
     cols = ((np.arange(x0, x1) + 0.5) * w / camera.width).astype(int)
     pick = np.ix_(rows, cols)
     return _Crop(
-        camera, p.view.frame.world_from_cam, rays, (y1 - y0, x1 - x0), torch.from_numpy(photo.reshape(-1, 3)), seen.rgb, seen.depth,
-        torch.from_numpy(p.known[pick].reshape(-1)), torch.from_numpy(np.ascontiguousarray(unchanged).reshape(-1, 3)),
+        camera,
+        p.view.frame.world_from_cam,
+        rays,
+        (y1 - y0, x1 - x0),
+        torch.from_numpy(photo.reshape(-1, 3)),
+        seen.rgb,
+        seen.depth,
+        torch.from_numpy(p.known[pick].reshape(-1)),
+        torch.from_numpy(np.ascontiguousarray(unchanged).reshape(-1, 3)),
         torch.from_numpy(p.changed.threshold[pick].reshape(-1)),
     )
 
@@ -340,7 +391,7 @@ def _described(r: Refiner, pose: Tensor, hessian: Tensor, unit: Tensor) -> PoseC
     free = int((held < c.unseen).sum())
     note = f"the photos do not show its turn about {'any axis' if free == 3 else f'{free} of 3 axes'}" if free else ""
     explained, before, count = _explained(r, pose)
-    return PoseChange(pose, covariance, noise, explained, before, count, note)
+    return PoseChange(pose, covariance, noise, explained, before, count, r.pixel, note)
 
 
 def _explained(r: Refiner, pose: Tensor) -> tuple[float, float, int]:
@@ -356,8 +407,3 @@ def _explained(r: Refiner, pose: Tensor) -> tuple[float, float, int]:
         without += int((here & (old < limit)).sum())
         count += int(here.sum())
     return with_it / max(count, 1), without / max(count, 1), count
-
-
-def footprint(r: Refiner, pose: Tensor) -> list[Array]:
-    """Opacity of the moved object in each crop; for pictures."""
-    return [r.show(c, pose).opacity.reshape(c.shape).numpy() for c in r.crops]

@@ -133,7 +133,11 @@ def stage(views: Sequence[View], depths: Sequence[Array], sigma_of: Sequence[flo
 
 
 def register(
-    cloud: Cloud, past: Sequence[Past], target: Target, up: Array, config: RegisterConfig = RegisterConfig(),
+    cloud: Cloud,
+    past: Sequence[Past],
+    target: Target,
+    up: Array,
+    config: RegisterConfig = RegisterConfig(),
     extra: Sequence[Tensor] = (),
 ) -> list[Candidate]:
     """The poses at which the object's surface explains the photos best, best first.
@@ -183,8 +187,19 @@ class _Search:
         # how many pixels apart the points of the visible half lie, for counting covered pixels
         block = int(np.clip(np.ceil(2.2 * max(self.size) / max(len(pick), 1) ** 0.5), 2, 12))
         return register_all(
-            points.astype(np.float64), self.cloud.colours[pick], ready.lenses, ready.images, ready.depths, wanted,
-            rotations, centres, steps, 0.15, self.config.cap, self.radius, block,
+            points.astype(np.float64),
+            self.cloud.colours[pick],
+            ready.lenses,
+            ready.images,
+            ready.depths,
+            wanted,
+            rotations,
+            centres,
+            steps,
+            0.15,
+            self.config.cap,
+            self.radius,
+            block,
         )
 
 

@@ -42,7 +42,7 @@ class SiftMatcher:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if scale != 1.0:
             grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        points, descriptors = cv2.SIFT_create(contrastThreshold=self.contrast).detectAndCompute(grey, None)
+        points, descriptors = cv2.SIFT.create(contrastThreshold=self.contrast).detectAndCompute(grey, None)
         if not points:
             return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
         xy = (np.array([p.pt for p in points], np.float64) + 0.5) / scale

@@ -5,12 +5,14 @@ Images are (H, W, 3) float32 RGB in [0, 1], masks (H, W) bool, numpy throughout.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+Image = NDArray[Any]
+Mask = NDArray[Any]
 
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
 
@@ -112,7 +114,7 @@ def fit_colours(source: Image, target: Image, rounds: int = 8) -> NDArray[np.flo
     (1, 0) where the pixels say nothing (too dark, saturated or flat).
     """
     out = np.stack([np.ones(3), np.zeros(3)])
-    usable = ((source > 0.02) & (source < 0.98) & (target > 0.02) & (target < 0.98)).all(-1)
+    usable = np.all((source > 0.02) & (source < 0.98) & (target > 0.02) & (target < 0.98), axis=-1)
     if usable.sum() < 50:
         return out
     x, y = source[usable].astype(np.float64), target[usable].astype(np.float64)

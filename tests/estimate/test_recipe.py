@@ -1,0 +1,86 @@
+"""What changed, end to end, on worlds that are known in closed form."""
+
+import pytest
+import torch
+
+from refield.estimate.recipe import EstimateConfig, estimate_change
+from refield.scene.errors import InputError
+from refield.scene.pose import angle_between, transform
+from tests.estimate.boxes import BoxWorld, capture_of, new_photos, standing, turn
+
+CRATE = standing((0.2, 0.17, 0.18), -0.25, -0.2, 20, paint=3)
+DRUM = standing((0.15, 0.15, 0.2), 0.4, 0.35, -10, paint=5)
+BEFORE = BoxWorld((CRATE, DRUM))
+
+
+@pytest.fixture(scope="module")
+def old(tmp_path_factory):
+    return capture_of(BEFORE, tmp_path_factory.mktemp("before"))
+
+
+def estimate(old, after, folder):
+    stages = []
+    change = estimate_change(old, BEFORE, new_photos(after, folder), EstimateConfig(survey=6), stages.append)
+    assert stages[0] == "detect"
+    return change
+
+
+def centre(box):
+    return box.world_from_box[:3, 3]
+
+
+def overlap(grid, box):
+    """IoU of a grid with a box."""
+    lo = torch.minimum(grid.tight_aabb()[0], centre(box).float() - 0.4)
+    hi = torch.maximum(grid.tight_aabb()[1], centre(box).float() + 0.4)
+    x = lo + (hi - lo) * torch.rand(200_000, 3, generator=torch.Generator().manual_seed(0))
+    a, b = grid.contains(x), box.inside(x)
+    return float((a & b).sum() / (a | b).sum())
+
+
+def test_a_moved_box_is_found_with_its_pose_shape_and_masks(old, tmp_path):
+    true = turn(centre(CRATE), 50, (0.35, -0.15, 0))
+    change = estimate(old, BoxWorld((CRATE.moved(true), DRUM)), tmp_path)
+    (moved,) = change.objects
+    assert moved.kind == "moved"
+    assert float(angle_between(moved.new_from_old, true)) < 0.7
+    c = centre(CRATE)
+    assert float((transform(moved.new_from_old, c) - transform(true, c)).norm()) < 0.006
+    assert overlap(moved.grid, CRATE) > 0.8
+    assert len(moved.masks) == len(moved.masks_in) == len(old.train)
+    assert all(m.shape == (80, 80) and m.dtype == torch.bool for m in moved.masks)
+    assert len(change.masks_in) == 4 and change.frames[0].name == "000.png"
+
+
+def test_a_box_tipped_onto_another_face_is_found(old, tmp_path):
+    true = turn(centre(CRATE), 90, (0.3, -0.2, -0.01), axis=(0, 1, 0))
+    (moved,) = estimate(old, BoxWorld((CRATE.moved(true), DRUM)), tmp_path).objects
+    assert moved.kind == "moved" and float(angle_between(moved.new_from_old, true)) < 1.5
+
+
+def test_a_removed_box_is_found(old, tmp_path):
+    (gone,) = estimate(old, BoxWorld((DRUM,)), tmp_path).objects
+    assert gone.kind == "removed" and gone.new_from_old is None
+    assert overlap(gone.grid, CRATE) > 0.8
+
+
+def test_an_added_box_is_found(old, tmp_path):
+    guest = standing((0.16, 0.16, 0.16), 0.1, -0.45, 35, paint=9)
+    (new,) = estimate(old, BoxWorld((CRATE, DRUM, guest)), tmp_path).objects
+    assert new.kind == "added" and new.masks == ()
+    assert overlap(new.grid, guest) > 0.4
+
+
+def test_nothing_changed_is_an_answer(old, tmp_path):
+    change = estimate(old, BEFORE, tmp_path)
+    assert change.objects == () and change.why
+
+
+def test_old_photos_given_as_new_have_not_changed(old):
+    assert estimate_change(old, BEFORE, old.frames[:4], EstimateConfig(survey=6)).objects == ()
+
+
+def test_another_scene_is_refused(old, tmp_path):
+    wall = standing((0.95, 0.95, 0.5), 0, 0, 0, paint=-1)
+    with pytest.raises(InputError, match="% of the pixels changed; is this the same scene"):
+        estimate(old, BoxWorld((wall,)), tmp_path)

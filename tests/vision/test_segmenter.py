@@ -1,0 +1,38 @@
+import numpy as np
+
+from refield.vision.segmenter import GrabCutSegmenter
+
+
+def scene():
+    rng = np.random.default_rng(0)
+    image = np.full((80, 80, 3), (120, 130, 90), np.uint8)
+    yy, xx = np.mgrid[:80, :80]
+    disc = (yy - 40) ** 2 + (xx - 36) ** 2 < 16**2
+    image[disc] = (200, 60, 50)
+    noisy = image + rng.normal(0, 5, image.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8), disc
+
+
+def iou(a, b):
+    return (a & b).sum() / (a | b).sum()
+
+
+def test_a_disc_is_cut_out_of_a_loose_box():
+    image, disc = scene()
+    masks, scores = GrabCutSegmenter().masks(image, np.array([[14, 18, 58, 62]]))
+    assert masks.shape == (1, 80, 80) and iou(masks[0], disc) > 0.9 and scores[0] > 0.9
+
+
+def test_a_hint_that_is_too_large_is_trimmed():
+    image, disc = scene()
+    yy, xx = np.mgrid[:80, :80]
+    hint = (yy - 40) ** 2 + (xx - 36) ** 2 < 20**2
+    masks, _ = GrabCutSegmenter().masks(image, np.array([[12, 16, 60, 64]]), hint[None])
+    assert iou(masks[0], disc) > 0.9
+
+
+def test_no_boxes_no_masks_and_features_have_the_promised_shape():
+    image, _ = scene()
+    masks, scores = GrabCutSegmenter().masks(image, np.zeros((0, 4)))
+    assert masks.shape == (0, 80, 80) and scores.shape == (0,)
+    assert GrabCutSegmenter().features(image).shape == (20, 20, 7)
