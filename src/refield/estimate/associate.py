@@ -47,6 +47,8 @@ class AssociateConfig:
     """part of an object's pixels that must show what was behind it, for it to have left"""
     arrived: float = 0.5
     """part of a newcomer's pixels that nothing else explains"""
+    newcomer: float = 0.01
+    """part of a photo that something new must fill in at least one of them (the paper's contour area, §10.2.2)"""
     still: float = 1.2
     """pixels; what moved by less stayed"""
     most: int = 5
@@ -102,7 +104,7 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
         for k, change in moved.items():
             views = take_off(ground.field, views, olds[k], change)
     gone = [olds[k] for k in kept]
-    arrived = newcomers(ground, arrivals(ground, views, gone), views)
+    arrived = [p for p in newcomers(ground, arrivals(ground, views, gone), views) if _substantial(ground, p, views)]
     moved = {k: c for k, c in moved.items() if _noticeable(olds[k], c, ground.believe.still)}
     return Settled(moved, removed, tuple(arrived), tuple(views))
 
@@ -161,6 +163,12 @@ def newcomers(ground: Ground, voxels: Voxels, past: Sequence[Past]) -> list[Voxe
             out.append(part)
             taken = [t | pixels.dilate(s, 1) for t, s in zip(taken, shadows)]
     return out
+
+
+def _substantial(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
+    """Whether a would-be newcomer is large enough in some photo; what is left over at the edge of others is not."""
+    shadows = [shadow_of(p.view, ground.hull.lattice, part) & p.open for p in past]
+    return max(float(s.mean()) for s in shadows) >= ground.believe.newcomer
 
 
 def _only_light(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:

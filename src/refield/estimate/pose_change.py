@@ -38,8 +38,6 @@ class RefineConfig:
     """pixels, coarse to fine"""
     steps: int = 6
     """Gauss–Newton steps at each blur (the paper: 500 of Adam)"""
-    grow: int = 2
-    """voxels around the object that are moved with it: a field's surface is a shell, not a sheet"""
     margin: int = 5
     """pixels around the object that are compared too"""
     outline: float = 0.2
@@ -164,7 +162,7 @@ class Refiner:
 
     @cached_property
     def grid(self) -> OccupancyGrid:
-        return self.old.grid(self.config.grow)
+        return self.old.grid()
 
     @property
     def apparent(self) -> float:
