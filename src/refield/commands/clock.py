@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Protocol
@@ -13,7 +14,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from refield.field.fit import FitProgress
 
+_WIDE = 120
 _QUIET_SECONDS = 5.0  # without a terminal a progress line appears this often
+
+
+def results() -> Console:
+    """Where tables of results go: stdout, wide enough for them even where it is no terminal."""
+    return Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE)
 
 
 class Clock:

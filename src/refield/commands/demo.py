@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from refield.commands.clock import Clock
+from refield.commands.clock import Clock, results
 from refield.commands.evaluate import table
 from refield.commands.page import evaluation_views
 from refield.commands.train import train
@@ -46,11 +45,11 @@ def run(options: Demo) -> None:
     if visit.evaluation is not None:
         write_contact_sheet(sheet, evaluation_views(visit.evaluation))
     _show(visit, load_change(sample / "truth"), psnr, clock)
-    Console().print(f"report: {visit.html}\nbefore and after: {sheet}", soft_wrap=True, highlight=False)
+    print(f"report: {visit.html}\nbefore and after: {sheet}")
 
 
 def _show(visit: Visit, truth: SceneChange, psnr: float, clock: Clock) -> None:
-    console = Console(highlight=False)
+    console = results()
     console.print(summary(visit.change))
     if visit.evaluation is not None:
         console.print(table(visit.evaluation, "views that nothing was fitted to"))

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated
 
-from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
 from refield.artefacts import writable
-from refield.commands.clock import Clock
+from refield.commands.clock import Clock, results
 from refield.evaluate import EvaluateConfig, Report, Scores, evaluate
 from refield.history import state
 from refield.scene.files import write_json
@@ -47,7 +45,7 @@ def run(options: Evaluate) -> None:
     if options.out is not None:
         with writable(options.out):
             write_json(options.out, report.to_dict())
-    Console(width=None if sys.stdout.isatty() else 120).print(table(report, f"visit {visit}"))
+    results().print(table(report, f"visit {visit}"))
 
 
 def table(report: Report, name: str) -> Table:

@@ -36,9 +36,7 @@ def run(options: Train) -> None:
     clock.console.print(f"The field is in {options.work} ({clock.total:.1f} s).", markup=False)
 
 
-def train(
-    data: Path, work: Path, clock: Clock, config: FitConfig, *, overwrite: bool, made_by: str = "train"
-) -> float:
+def train(data: Path, work: Path, clock: Clock, config: FitConfig, *, overwrite: bool, made_by: str = "train") -> float:
     """Load, fit, keep. Returns the PSNR on held-out pixels, dB (NaN where none is held out).
 
     Raises:

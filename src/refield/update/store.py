@@ -33,8 +33,10 @@ def save_updated(folder: Path, field: UpdatedField) -> None:
     }
     for i, grid in enumerate(field.region.grids):
         tensors |= {f"region.{i}.aabb": grid.aabb, f"region.{i}.values": grid.values}
-    if field.light is not None:
-        tensors |= {"light.aabb": field.light.aabb, "light.log_gain": field.light.log_gain}
+    facts["shading"] = len(field.shading)
+    tensors |= _light_out("light", field.light)
+    for i, light in enumerate(field.shading):
+        tensors |= _light_out(f"shading.{i}", light)
     if field.helper is not None:
         if not isinstance(field.helper, HashField):
             raise TypeError(f"a helper of type {type(field.helper).__name__} cannot be saved")
@@ -53,10 +55,21 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
     try:
         regions = range(facts["regions"])
         grids = [OccupancyGrid(tensors[f"region.{i}.aabb"], tensors[f"region.{i}.values"]) for i in regions]
-        light = Relighting(tensors["light.aabb"], tensors["light.log_gain"]) if "light.aabb" in tensors else None
+        light = _light_in("light", tensors)
+        shading = tuple(_light_in(f"shading.{i}", tensors) for i in range(facts["shading"]))
         own = {name.removeprefix("helper."): t for name, t in tensors.items() if name.startswith("helper.")}
         helper = HashField.from_state(own, facts["helper"]) if facts["helper"] is not None else None
         sampler = replace(pretrained.sampler, grid=tensors["occupancy"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(folder, f"does not describe an updated field ({error})", _REMEDY) from None
-    return UpdatedField(pretrained, change, helper, region=Region(tuple(grids)), light=light, sampler=sampler)
+    region = Region(tuple(grids))
+    return UpdatedField(pretrained, change, helper, region=region, light=light, shading=shading, sampler=sampler)
+
+
+def _light_out(name: str, light: Relighting | None) -> dict[str, Tensor]:
+    return {} if light is None else {f"{name}.aabb": light.aabb, f"{name}.log_gain": light.log_gain}
+
+
+def _light_in(name: str, tensors: dict[str, Tensor]) -> Relighting | None:
+    aabb = tensors.get(f"{name}.aabb")
+    return None if aabb is None else Relighting(aabb, tensors[f"{name}.log_gain"])

@@ -1,0 +1,76 @@
+"""An updated field that was saved and loaded is the same field."""
+
+import inspect
+
+import pytest
+import torch
+
+from refield.artefacts import read_tensors, write_tensors
+from refield.field.encoding import Contraction
+from refield.field.radiance import HashField, HashFieldConfig
+from refield.field.render import render_rays
+from refield.field.sampling import OccupancySampler
+from refield.scene.capture import Rays
+from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
+from refield.scene.errors import InputError
+from refield.scene.pose import exp
+from refield.update.composite import UpdatedField
+from refield.update.light import Relighting
+from refield.update.store import load_updated, save_updated
+
+STORED = {"pretrained", "change", "helper", "region", "light", "shading", "sampler"}
+
+
+def small_field(seed: int) -> HashField:
+    g = torch.Generator().manual_seed(seed)
+    grid = (torch.rand(16, 16, 16, generator=g) > 0.3).to(torch.uint8)
+    sampler = OccupancySampler(Contraction(torch.zeros(3), 1.0), grid, 0.1)
+    config = HashFieldConfig(levels=3, coarsest=4, finest=16, log2_table=10, width=8)
+    field = HashField(config, sampler, seed)
+    with torch.no_grad():
+        field.encoding.tables.normal_(generator=g)
+    return field.eval().requires_grad_(False)
+
+
+def a_light(seed: int) -> Relighting:
+    box = torch.tensor([[-0.8, -0.8, -0.8], [0.8, 0.8, 0.8]])
+    return Relighting(box, torch.randn(4, 4, 4, 3, generator=torch.Generator().manual_seed(seed)) * 0.3)
+
+
+def a_change() -> SceneChange:
+    grid = OccupancyGrid(torch.tensor([[-0.4, -0.4, -0.4], [0.0, 0.0, 0.0]]), torch.ones(6, 6, 6))
+    there = OccupancyGrid(torch.tensor([[0.1, 0.1, 0.1], [0.3, 0.3, 0.3]]), torch.ones(6, 6, 6))
+    turn = exp(torch.tensor([0.3, 0.2, 0.1, 0.0, 0.2, 0.3], dtype=torch.float64))
+    return SceneChange((ObjectChange("moved", grid, turn), ObjectChange("removed", there)))
+
+
+@pytest.mark.parametrize("helped", [True, False])
+@pytest.mark.parametrize("lit", [True, False])
+def test_round_trip(tmp_path, helped, lit):
+    old, change = small_field(0), a_change()
+    light, shading = (a_light(1), (a_light(2),)) if lit else (None, (None,))
+    helper = small_field(3) if helped else None
+    field = UpdatedField(old, change, helper, light=light, shading=shading)
+    save_updated(tmp_path, field)
+    back = load_updated(tmp_path, old, change)
+    x = torch.rand(3000, 3) * 2 - 1
+    d = torch.nn.functional.normalize(torch.randn(3000, 3), dim=-1)
+    for ours, theirs in zip(field(x, d), back(x, d)):
+        assert torch.equal(ours, theirs)
+    assert torch.equal(field.sampler.grid, back.sampler.grid)
+    rays = Rays(torch.tensor([[0.0, 0.0, -3.0]]).expand(200, 3), torch.nn.functional.normalize(-x[:200] + 3, dim=-1))
+    assert torch.equal(render_rays(field, rays).rgb, render_rays(back, rays).rgb)
+
+
+def test_nothing_is_forgotten():
+    """A new part of an updated field has to be stored too."""
+    assert set(inspect.signature(UpdatedField.__init__).parameters) - {"self"} == STORED
+
+
+def test_damage_is_named(tmp_path):
+    old, change = small_field(0), a_change()
+    save_updated(tmp_path, UpdatedField(old, change, small_field(3)))
+    tensors, facts = read_tensors(tmp_path)
+    write_tensors(tmp_path, {k: v for k, v in tensors.items() if k != "region.0.values"}, facts)
+    with pytest.raises(InputError, match=r"region\.0\.values"):
+        load_updated(tmp_path, old, change)
