@@ -47,11 +47,11 @@ def test_noise_is_not_light() -> None:
 def test_what_only_one_photo_says_is_not_believed() -> None:
     x = floor_points()
     seen = ground(1.0, x, noise=0.02)
-    dark = (seen.view == 2) & ((x[:, :2]).norm(dim=-1) < 0.3)
-    one_liar = Sightings(seen.x, torch.where(dark[:, None], 0.4 * seen.photo, seen.photo), seen.rendered, seen.view)
+    dark = (seen.fold == 2) & ((x[:, :2]).norm(dim=-1) < 0.3)
+    one_liar = Sightings(seen.x, torch.where(dark[:, None], 0.4 * seen.photo, seen.photo), seen.rendered, seen.fold)
     light = fit_light(one_liar, BOX, spacing=0.06)
     assert light is None or float((light.gain(x) - 1).abs().max()) < 0.05
-    alone = seen[(seen.view == 0).nonzero()[:, 0]]
+    alone = seen[(seen.fold == 0).nonzero()[:, 0]]
     assert fit_light(alone, BOX, spacing=0.06) is None
 
 

@@ -57,10 +57,16 @@ def move_in(x: Tensor, d: Tensor, moves: tuple[Move, ...]) -> tuple[Tensor, Tens
     World points and directions (S, 3) -> where and along what to ask, (S, 3) each, and which move did it, (S,)
     int64, -1 where nothing moved in. Differentiable in x, d and ``new_from_old``.
     """
+    owner = owners(x, moves)
+    return *looked_up(x, d, owner, [m.old_from_new for m in moves]), owner
+
+
+def owners(x: Tensor, moves: tuple[Move, ...]) -> Tensor:
+    """The first move that brought something to each world point (S, 3), (S,) int64; -1 where none did."""
     owner = torch.full(x.shape[:1], -1, dtype=torch.long, device=x.device)
     for i, move in enumerate(moves):
         owner[move.arrived(x) & (owner < 0)] = i
-    return *_looked_up(x, d, owner, [m.old_from_new for m in moves]), owner
+    return owner
 
 
 def two_way(x: Tensor, d: Tensor, move: Move) -> tuple[Tensor, Tensor]:
@@ -71,11 +77,11 @@ def two_way(x: Tensor, d: Tensor, move: Move) -> tuple[Tensor, Tensor]:
     in_new = move.arrived(x)
     in_old = move.grid.contains(x.detach()) & ~in_new
     owner = torch.where(in_new, 0, torch.where(in_old, 1, -1))
-    return _looked_up(x, d, owner, [move.old_from_new, move.new_from_old])
+    return looked_up(x, d, owner, [move.old_from_new, move.new_from_old])
 
 
-def _looked_up(x: Tensor, d: Tensor, owner: Tensor, poses: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Points and directions of each owner moved by its pose; the others are left as they are."""
+def looked_up(x: Tensor, d: Tensor, owner: Tensor, poses: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Points and directions (S, 3) of each owner moved by its pose; the others are left as they are."""
     for i, pose in enumerate(poses):
         mine = (owner == i).nonzero()[:, 0]
         if len(mine):

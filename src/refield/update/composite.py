@@ -16,15 +16,19 @@ from refield.field.radiance import Field, HashField
 from refield.field.render import visible_samples
 from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples
-from refield.field.warp import Move, inside_box, move_in, moves_of
+from refield.field.warp import Move, inside_box, looked_up, moves_of, owners
 from refield.scene.capture import Rays
-from refield.scene.change import SceneChange
+from refield.scene.change import OccupancyGrid, SceneChange
 from refield.update.light import Relighting
 from refield.update.region import Region, carved, move_out
 
 DILATION = 2.0
 """M_out is the object's grid, its box this many times as large (§10.1.3: 2 to 3)."""
 
+SKIN = 1.0
+"""How much further than its grid a moved object reaches, in samples of the old field"""
+
+_SOLID = 0.05  # opacity of a sample that was not empty before
 _PROBES = 8  # points a cell looked up when the sampler is recomputed: a moved surface crosses cells at any angle
 
 
@@ -39,18 +43,23 @@ class UpdatedField:
         *,
         region: Region | None = None,
         light: Relighting | None = None,
+        shading: tuple[Relighting | None, ...] = (),
         sampler: OccupancySampler | None = None,
     ) -> None:
         """``region`` is where the helper speaks (M_out of the change by default); with no helper it is cut out
-        (the objects' own grids by default). ``sampler`` is recomputed where things changed unless it is given."""
+        (the objects' own grids by default). ``light`` changes what stood still, ``shading`` each moved object, at its
+        old place. ``sampler`` is recomputed where things changed unless it is given."""
         self.pretrained, self.change, self.helper, self.light = pretrained, change, helper, light
+        self.shading = shading
         self.why_stopped = ""
         """what ended the helper's training, in words; empty if it was not trained here"""
         if region is None:
             region = carved(change) if helper is None else move_out(change, DILATION)
         self.region = region
         self.moves: tuple[Move, ...] = moves_of(change)
-        self.boxes = tuple(m.box_now for m in self.moves) + region.boxes
+        self._shells = tuple(Move(_grown(m.grid, SKIN * pretrained.sampler.step), m.new_from_old) for m in self.moves)
+        self.sampler_step = pretrained.sampler.step
+        self.boxes = tuple(m.box_now for m in self._shells) + region.boxes
         if sampler is None:
             sampler = pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES)
         self.sampler = sampler
@@ -111,8 +120,7 @@ class UpdatedField:
         flat, along = x.reshape(-1, 3), d.reshape(-1, 3)
         asked, turned, owner, old, new = self._route(flat, along)
         s, c = self.pretrained(asked[old], turned[old])
-        if self.light is not None:
-            c = self._relit(flat[old], c, owner[old] < 0)
+        c = self._relit(asked[old], c, owner[old])
         sigma = flat.new_zeros(len(flat)).index_copy(0, old, s)
         rgb = torch.zeros_like(flat).index_copy(0, old, c)
         if self.helper is not None and len(new):
@@ -128,11 +136,28 @@ class UpdatedField:
         near = self._near(x.detach()).nonzero()[:, 0]
         if len(near) == 0:
             return x, d, owner, torch.arange(len(x), device=x.device), near
-        at, along, mover = move_in(x[near], d[near], self.moves)
+        mover = self.arrived(x[near])
         owner[near] = mover
         inside[near] = (mover < 0) & self.region.contains(x[near])
+        at, along = looked_up(x[near], d[near], mover, [m.old_from_new for m in self.moves])
         asked, turned = x.index_copy(0, near, at), d.index_copy(0, near, along)
         return asked, turned, owner, (~inside).nonzero()[:, 0], inside.nonzero()[:, 0]
+
+    def arrived(self, x: Tensor) -> Tensor:
+        """Which move each world point (S, 3) is answered by, (S,) int64, -1 for none.
+
+        A fitted surface is a step or so thick: the moved object takes its skin along, to places that were empty and
+        are nobody else's. What was solid there stays (the ground it stands on now).
+        """
+        owner = owners(x, self.moves)
+        skin = torch.where(owner < 0, owners(x, self._shells), -1)
+        rows = (skin >= 0).nonzero()[:, 0]
+        if len(rows):
+            at = x[rows].detach()
+            solid = self.pretrained.density(at) * self.sampler_step > _SOLID
+            free = ~solid | self.region.contains(at)
+            owner[rows[free]] = skin[rows[free]]
+        return owner
 
     def _near(self, x: Tensor) -> Tensor:
         near = torch.zeros(len(x), dtype=torch.bool, device=x.device)
@@ -140,10 +165,19 @@ class UpdatedField:
             near |= inside_box(x, box)
         return near
 
-    def _relit(self, x: Tensor, rgb: Tensor, still: Tensor) -> Tensor:
-        """The new light on what did not move."""
-        assert self.light is not None
-        return torch.where(still[:, None], self.light.applied(x, rgb), rgb)
+    def _relit(self, asked: Tensor, rgb: Tensor, owner: Tensor) -> Tensor:
+        """Colours of the old field (S, 3), asked for at (S, 3), in the new light; ``owner`` (S,) is -1 for what did
+        not move."""
+        for i, light in enumerate((self.light, *self.shading), start=-1):
+            if light is not None:
+                rgb = torch.where((owner == i)[:, None], light.applied(asked, rgb), rgb)
+        return rgb
+
+
+def _grown(grid: OccupancyGrid, reach: float) -> OccupancyGrid:
+    """A grid grown by ``reach`` world units on every side."""
+    box = grid.tight_aabb()
+    return grid.dilated(1 + 2 * reach / float((box[1] - box[0]).mean()))
 
 
 def _base_of(field: Field) -> HashField | None:

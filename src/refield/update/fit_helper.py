@@ -14,9 +14,8 @@ from refield.field.fit import NonFiniteError, TableAdam, rate_factor
 from refield.field.losses import colour_loss, distortion_loss
 from refield.field.radiance import HashField
 from refield.field.volrend import Samples, accumulate_rgb
-from refield.field.warp import Move, moves_of
 from refield.scene.capture import Rays
-from refield.scene.change import SceneChange
+from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.frozen import Segments, Woven, weave
 from refield.update.helper import HelperOccupancy, emptiness
@@ -49,12 +48,11 @@ class HelperTraining:
     """One run: the helper between fixed segments, until held-out pixels stop gaining."""
 
     def __init__(
-        self, helper: HashField, change: SceneChange, sparse: Lit, old: Lit, judge: Lit, config: UpdateConfig
+        self, helper: HashField, frozen: UpdatedField, sparse: Lit, old: Lit, judge: Lit, config: UpdateConfig
     ) -> None:
-        self.helper, self.config = helper, config
-        self.moves: tuple[Move, ...] = moves_of(change)
+        self.helper, self.config, self.frozen = helper, config, frozen
         self.sparse, self.old, self.judge = sparse, old, judge
-        self.empty = emptiness(change, helper.sampler)
+        self.empty = emptiness(frozen.change, helper.sampler)
         self.occupancy = HelperOccupancy(helper)
         self.adam = TableAdam(helper, config.rate)
         self.rays_per_step, self.bad, self.steps_done = 1024, 0, 0
@@ -79,6 +77,7 @@ class HelperTraining:
                 if len(looks) > n and max(looks[-n:]) < max(looks[:-n]) + c.least_gain:
                     self.why_stopped = "held-out pixels stopped gaining"
                     break
+        self.occupancy.settle()
         return looks
 
     def psnr(self, lit: Lit) -> float:
@@ -119,9 +118,7 @@ class HelperTraining:
     def _outside_moved(self, samples: Samples, rays: Rays) -> Samples:
         """Without the samples inside what moved in (§10.1.2)."""
         x, _ = samples.positions(rays)
-        taken = torch.zeros(len(x), dtype=torch.bool)
-        for move in self.moves:
-            taken |= move.arrived(x)
+        taken = self.frozen.arrived(x) >= 0
         if not taken.any():
             return samples
         kept = torch.bincount(samples.ray_ids[~taken], minlength=len(rays))

@@ -56,7 +56,7 @@ def composite_once(field: Field, region: OccupancySampler, rays: Rays) -> Segmen
     ``field`` must be empty inside the region, but for what stays fixed there (objects that moved in).
     """
     with torch.no_grad():
-        parts = [_composite_chunk(field, region, rays[i : i + _CHUNK]) for i in range(0, len(rays), _CHUNK)]
+        parts = [_composite_chunk(field, region, rays[i : i + _CHUNK]) for i in range(0, max(len(rays), 1), _CHUNK)]
     counts = torch.cat([p.offsets.diff() for p in parts])
     return Segments(
         torch.cat([p.t_mid for p in parts]),

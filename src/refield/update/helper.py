@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
+from torch.nn import functional
 
 from refield.field.occupancy import OccupancyTrainer
 from refield.field.radiance import Field, HashField, HashFieldConfig
@@ -12,7 +13,8 @@ from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Frame
 from refield.scene.change import SceneChange
 
-_RESOLUTION = 128
+_OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
+_WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
 _DEPTH = 0.12  # of an object's mean side: so far inside, nothing that stood there can have been
 
 
@@ -64,3 +66,18 @@ class HelperOccupancy:
         """After each step: samples' positions (S, 3), weights (S,) and densities (S,)."""
         self.trainer.observe(step, x, w, sigmas)
         self.helper.looking_where(self.helper.sampler.grid & self.allowed)
+
+    def settle(self) -> None:
+        """The grid to show: opaque cells next to what training rays saw. Few photos see little of a surface; a view
+        between them must find no holes in it."""
+        cells = self.allowed.reshape(-1).nonzero()[:, 0]
+        s = self.helper.sampler
+        self.helper.train()  # ask everywhere, not only where training looked last
+        with torch.no_grad():
+            sigma = torch.stack([self.helper.density(s.points_in(cells, jitter=i > 0)) for i in range(4)]).amax(0)
+        opaque = torch.zeros_like(self.allowed)
+        opaque.view(-1)[cells] = (-torch.expm1(-sigma * s.step) > _OPACITY).to(torch.uint8)
+        seen = (self.trainer.weight > _WEIGHT).reshape(1, 1, *self.allowed.shape).float()
+        near = functional.max_pool3d(seen, 5, stride=1, padding=2)[0, 0] > 0
+        self.helper.looking_where(opaque * near)
+        self.helper.eval()

@@ -2,7 +2,7 @@
 
 A shadow changes the colour of a surface by a factor, and nothing of its geometry. `Relighting` is that factor on a
 lattice, 1 where nothing is known against it. It is fitted in closed form from the new photos and kept only where
-photos that were left out of a fit confirm it. Letters: P pixels, C lattice nodes.
+pixels that were left out of a fit confirm it. Letters: P pixels, C lattice nodes.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ class Sightings:
     """(P, 3) in [0, 1], in the old exposure"""
     rendered: Tensor
     """(P, 3) in [0, 1]"""
-    view: Tensor
-    """(P,) int64: the new photo's index"""
+    fold: Tensor
+    """(P,) int64: the group that a pixel belongs to when one group after the other is left out of the fit"""
 
     def __getitem__(self, chosen: Tensor) -> Sightings:
-        return Sightings(self.x[chosen], self.photo[chosen], self.rendered[chosen], self.view[chosen])
+        return Sightings(self.x[chosen], self.photo[chosen], self.rendered[chosen], self.fold[chosen])
 
 
 _COARSER = (4, 2, 1)  # lattice spacings of the pyramid, in the finest
@@ -68,15 +68,15 @@ _MOST = 3.0  # factors are held within [1 / this, this]
 def fit_light(seen: Sightings, box: Tensor, spacing: float) -> Relighting | None:
     """Least-squares factors on a lattice of ``spacing`` (world units) in a world ``box`` (2, 3).
 
-    None if no part of it is confirmed: each photo's pixels must be explained better by the factors fitted to the
-    *other* photos than by none.
+    None if no part of it is confirmed: each fold's pixels must be explained better by the factors fitted to the
+    *other* folds than by none.
     """
     inside = inside_box(seen.x, box)
     seen = seen[inside.nonzero()[:, 0]]
-    views = seen.view.unique()
-    if len(views) < 2:
+    folds = seen.fold.unique()
+    if len(folds) < 2:
         return None
-    kept = _confirmed(seen, views, box, spacing)
+    kept = _confirmed(seen, folds, box, spacing)
     if not kept.any():
         return None
     gain = _pyramid(seen, box, spacing)
@@ -84,12 +84,12 @@ def fit_light(seen: Sightings, box: Tensor, spacing: float) -> Relighting | None
     return Relighting(box, torch.log(gain) * fade)
 
 
-def _confirmed(seen: Sightings, views: Tensor, box: Tensor, spacing: float) -> Tensor:
-    """Nodes (X, Y, Z) bool around which the factors of the other photos lower a photo's error."""
+def _confirmed(seen: Sightings, folds: Tensor, box: Tensor, spacing: float) -> Tensor:
+    """Nodes (X, Y, Z) bool around which the factors of the other folds lower a fold's error."""
     shape = _shape(box, spacing)
     errors = []
-    for view in views:
-        out = seen.view == view
+    for fold in folds:
+        out = seen.fold == fold
         gain = _pyramid(seen[~out], box, spacing)
         left_out = seen[out]
         factor = _gather(gain, left_out.x, box)

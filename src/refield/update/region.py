@@ -44,7 +44,7 @@ class Region:
                 found[near] = grid.contains(flat[near])
         return found.reshape(x.shape[:-1])
 
-    def sampler(self, step: float, resolution: int = 128) -> OccupancySampler:
+    def sampler(self, step: float, resolution: int = 64) -> OccupancySampler:
         """Looks everywhere in the region and nowhere else; its core cube is the region's bounding cube."""
         box = self.box
         space = Contraction(box.mean(0), float((box[1] - box[0]).max()) / 2 * 1.02)

@@ -85,7 +85,7 @@ def places_of(change: SceneChange) -> Places:
 
 def _place(grid: OccupancyGrid, masks: tuple[Tensor | None, ...], arrived_only: bool) -> Place:
     size = float((grid.aabb[1] - grid.aabb[0]).max())
-    return Place(masks, Region((grid,)).sampler(size / 100), arrived_only)
+    return Place(masks, Region((grid,)).sampler(size / 100, resolution=128), arrived_only)
 
 
 def old_ring(places: Places, index: int, frame: Frame, shadow: float, far: float) -> Tensor | None:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from refield.field.pixels import PixelBank
 from refield.field.radiance import Field
 from refield.field.render import render_many
 from refield.field.sampling import OccupancySampler
-from refield.scene.capture import Capture
+from refield.field.warp import outline
+from refield.scene.capture import Capture, Frame
 from refield.scene.change import SceneChange
+from refield.scene.pose import transform
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.fit_helper import HelperTraining, Lit, UpdateProgress
@@ -25,6 +29,7 @@ from refield.update.supervision import Lessons, Places, changed_pixels, new_less
 from refield.vision.pixels import dilate
 
 DEFAULTS = UpdateConfig()
+_PATCHES, _FOLDS, _SHADING_CELLS = 8, 4, 6  # an object's side in patches that are left out together; in cells
 _RING_RAYS = 40_000  # of the old photos; more add time and nothing to learn
 
 
@@ -55,22 +60,25 @@ def update_field(
     changed = [changed_pixels(change, places, i, f) for i, f in enumerate(change.frames)]
     sparse = new_lessons(change.frames, cut, changed)
     light = _light(sparse, field, change, changed) if config.relight else None
+    shading = _shading(sparse, cut, change) if config.relight else ()
     say("supervise")
     wide = move_out(change, config.dilation)
-    region = wide.sampler(step_near(field, wide.box.mean(0)))
+    region = _in_reach(wide.sampler(step_near(field, wide.box.mean(0))), capture.train + change.frames)
     old = _old_lessons(capture, field, places, region, config, light)
     sparse = sparse[meets(region, sparse.rays).nonzero()[:, 0]]
+    if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
+        return cut
     say("freeze")
-    frozen = UpdatedField(field, change, region=wide, light=light)
+    frozen = UpdatedField(field, change, region=wide, light=light, shading=shading)
     new_taught, judge = _split(Lit(sparse, composite_once(frozen, region, sparse.rays)), config.held_out)
     old_taught = Lit(old, composite_once(frozen, region, old.rays))
     say("train")
     helper = new_helper(region, change.frames, config.seed)
-    run = HelperTraining(helper, change, new_taught, old_taught, judge, config)
+    run = HelperTraining(helper, frozen, new_taught, old_taught, judge, config)
     run.run(on_progress)
     say("show")
-    helper.eval().requires_grad_(False)
-    updated = UpdatedField(field, change, helper, region=move_out(change, config.shown), light=light)
+    helper.requires_grad_(False)
+    updated = UpdatedField(field, change, helper, region=wide, light=light, shading=shading)
     updated.why_stopped = run.why_stopped
     return updated
 
@@ -84,8 +92,15 @@ def _split(lit: Lit, every: int) -> tuple[Lit, Lit]:
     return taught, judge
 
 
+def _in_reach(region: OccupancySampler, frames: tuple[Frame, ...]) -> OccupancySampler:
+    """The same region, its rays no longer than it takes to cross it from the furthest photo."""
+    space = region.contraction
+    furthest = max(float((f.centre.float() - space.centre).norm()) for f in frames)
+    return replace(region, far=furthest / space.radius + 2)
+
+
 def _light(sparse: Lessons, field: Field, change: SceneChange, changed: list[np.ndarray]) -> Relighting | None:
-    """The light on what did not change, from the new photos' pixels that show it."""
+    """The light on what did not change, from the new photos' pixels that show it; each photo is a fold."""
     still = torch.cat([torch.from_numpy(~dilate(c, math.ceil(0.01 * c.shape[1]))).reshape(-1) for c in changed])
     seen = sparse[still.nonzero()[:, 0]]
     was = render_many(field, seen.rays)
@@ -94,8 +109,33 @@ def _light(sparse: Lessons, field: Field, change: SceneChange, changed: list[np.
     box = Region(tuple(g for o in change.objects for g in (o.grid, o.grid_now) if g is not None)).box
     side = max(float((o.grid.tight_aabb().diff(dim=0)).max()) for o in change.objects)
     box = torch.stack([box[0] - 1.5 * side, box[1] + 1.5 * side])
-    pixel = min(float((f.centre.float() - box.mean(0)).norm()) / f.camera.fx for f in change.frames)
-    return fit_light(Sightings(x, seen.rgb, was.rgb, seen.photo)[solid], box, 1.5 * pixel)
+    return fit_light(Sightings(x, seen.rgb, was.rgb, seen.photo)[solid], box, 1.5 * _pixel(change, box.mean(0)))
+
+
+def _pixel(change: SceneChange, x: Tensor) -> float:
+    """Side of a new photo's pixel at a world point (3,), world units."""
+    return min(float((f.centre.float() - x).norm()) / f.camera.fx for f in change.frames)
+
+
+def _shading(sparse: Lessons, cut: UpdatedField, change: SceneChange) -> tuple[Relighting | None, ...]:
+    """How each moved object's own look changed with its place, kept at its old one.
+
+    A side of it is often in one photo only, so patches of a photo are the folds, not photos.
+    """
+    out: list[Relighting | None] = []
+    for i, move in enumerate(cut.moves):
+        near = meets(Region((move.grid.moved(move.new_from_old),)).sampler(cut.sampler.step), sparse.rays)
+        seen = sparse[near.nonzero()[:, 0]]
+        now = render_many(cut, seen.rays)
+        x = seen.rays.origins + seen.rays.directions * now.depth[:, None]
+        asked = transform(move.old_from_new, x)
+        solid = ((now.opacity > 0.9) & (cut.arrived(x) == i)).nonzero()[:, 0]
+        box = outline(move.grid)
+        patch = (asked / (float((box[1] - box[0]).mean()) / _PATCHES)).floor().long()
+        fold = (patch * torch.tensor([1, 3, 5])).sum(-1).remainder(_FOLDS)
+        spacing = max(float((box[1] - box[0]).mean()) / _SHADING_CELLS, 2 * _pixel(change, x.mean(0)))
+        out.append(fit_light(Sightings(asked, seen.rgb, now.rgb, fold)[solid], box, spacing) if len(solid) else None)
+    return tuple(out)
 
 
 def _old_lessons(
