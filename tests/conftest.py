@@ -9,7 +9,7 @@ import pytest
 from refield.cli import main
 from tests.captures import write_capture
 
-TINY_FIT = ["--fit.steps", "3", "--fit.samples", "2048", "--fit.field.levels", "2"]
+TINY_FIT = ["--fit.steps", "60", "--fit.samples", "2048", "--fit.field.levels", "2"]
 TINY_FIT += ["--fit.field.log2-table", "8", "--fit.field.width", "8"]
 
 

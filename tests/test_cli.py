@@ -118,7 +118,7 @@ def test_nothing_changed_writes_only_the_report(place, monkeypatch, capsys):
 
 
 def test_updates_stack(place, monkeypatch, capsys):
-    monkeypatch.setattr(update, "MOST_LOST", 100.0)  # three steps of fitting know nothing
+    monkeypatch.setattr(update, "MOST_LOST", 100.0)  # so short a fit knows nothing
     believing(monkeypatch, "removed")
     assert main(["update", "work", "new", *FEW]) == 0
     assert "1 object changed: 1 removed" in capsys.readouterr().out

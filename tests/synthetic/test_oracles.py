@@ -113,7 +113,7 @@ def test_an_unknown_image_is_refused(views):
 
 
 def test_the_commuting_square(world, field):
-    """DESIGN §7: updating the old world's field by the true change shows the new world."""
+    """Updating the old world's field by the true change shows the new world."""
     from refield.update.composite import UpdatedField
 
     (change,) = world.changes

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 _F32 = NDArray[Any]
 _F64 = NDArray[Any]
+_I64 = NDArray[Any]
 
 
 @njit(cache=True, fastmath=True)
@@ -70,33 +71,83 @@ def _rodrigues(w: _F64) -> _F64:
 
 
 @njit(cache=True, fastmath=True)
-def _step(
-    points: _F64, colours: _F32, lenses: _F64, images: _F32, depths: _F32, r: _F64, c: _F64, scale: float, radius: float
-) -> bool:
-    """One damped Gauss–Newton step on the photos' colours at the points; changes r and c in place."""
-    h, g = np.zeros((6, 6)), np.zeros(6)
-    at, px = np.zeros(6), np.zeros(9)
-    row = np.zeros(6)
+def _place(points: _F64, n: int, r: _F64, c: _F64, out: _F64) -> None:
+    """Point n at its new place: out = position (3), offset from the centre (3), normal (3)."""
+    for i in range(3):
+        q = r[i, 0] * points[n, 0] + r[i, 1] * points[n, 1] + r[i, 2] * points[n, 2]
+        out[i], out[3 + i] = q + c[i], q
+        out[6 + i] = r[i, 0] * points[n, 3] + r[i, 1] * points[n, 4] + r[i, 2] * points[n, 5]
+
+
+@njit(cache=True, fastmath=True)
+def _facing(lens: _F64, p: _F64) -> tuple[float, float]:
+    """Cosine between a placed point's normal and the way to a view, and the distance to it."""
+    x, y, z = p[0] - lens[23], p[1] - lens[24], p[2] - lens[25]
+    distance = math.sqrt(x * x + y * y + z * z)
+    return -(p[6] * x + p[7] * y + p[8] * z) / distance, distance
+
+
+@njit(cache=True, fastmath=True)
+def _gains(
+    points: _F64, sides: _I64, colours: _F32, lenses: _F64, images: _F32, depths: _F32, r: _F64, c: _F64, radius: float
+) -> _F64:
+    """How much brighter each side of the object is where it is now: grey factors, held near 1 where little is seen."""
+    count = 0
+    for n in range(sides.shape[0]):
+        count = max(count, sides[n] + 1)
+    num, den = np.zeros(count), np.zeros(count)
+    p, at, px = np.zeros(9), np.zeros(6), np.zeros(9)
     for n in range(points.shape[0]):
-        qx = r[0, 0] * points[n, 0] + r[0, 1] * points[n, 1] + r[0, 2] * points[n, 2]
-        qy = r[1, 0] * points[n, 0] + r[1, 1] * points[n, 1] + r[1, 2] * points[n, 2]
-        qz = r[2, 0] * points[n, 0] + r[2, 1] * points[n, 1] + r[2, 2] * points[n, 2]
-        nx = r[0, 0] * points[n, 3] + r[0, 1] * points[n, 4] + r[0, 2] * points[n, 5]
-        ny = r[1, 0] * points[n, 3] + r[1, 1] * points[n, 4] + r[1, 2] * points[n, 5]
-        nz = r[2, 0] * points[n, 3] + r[2, 1] * points[n, 4] + r[2, 2] * points[n, 5]
+        _place(points, n, r, c, p)
         for v in range(lenses.shape[0]):
-            lens = lenses[v]
-            x, y, z = qx + c[0], qy + c[1], qz + c[2]
-            vx, vy, vz = x - lens[23], y - lens[24], z - lens[25]
-            dist = math.sqrt(vx * vx + vy * vy + vz * vz)
-            cosine = -(nx * vx + ny * vy + nz * vz) / dist
-            if cosine < 0.2 or not _project(lens, x, y, z, at):
+            cosine, distance = _facing(lenses[v], p)
+            if cosine < 0.2 or not _project(lenses[v], p[0], p[1], p[2], at):
                 continue
-            if dist > depths[v, int(at[1]), int(at[0])] + 0.3 * radius:
+            if distance > depths[v, int(at[1]), int(at[0])] + 0.3 * radius:
                 continue
             _sample(images[v], at[0], at[1], px)
-            e0, e1, e2 = px[0] - colours[n, 0], px[1] - colours[n, 1], px[2] - colours[n, 2]
-            weight = cosine / (1 + (e0 * e0 + e1 * e1 + e2 * e2) / scale**2) ** 2
+            for k in range(3):
+                num[sides[n]] += cosine * px[k] * colours[n, k]
+                den[sides[n]] += cosine * colours[n, k] ** 2
+    out = np.ones(count)
+    hold = 0.1 * den.sum() / count + 1e-9
+    for b in range(count):
+        out[b] = min(2.2, max(0.45, (num[b] + hold) / (den[b] + hold)))
+    return out
+
+
+@njit(cache=True, fastmath=True)
+def _step(
+    points: _F64,
+    sides: _I64,
+    colours: _F32,
+    lenses: _F64,
+    images: _F32,
+    depths: _F32,
+    r: _F64,
+    c: _F64,
+    scale: float,
+    radius: float,
+) -> bool:
+    """One damped Gauss–Newton step on the photos' colours at the points; changes r and c in place."""
+    gains = _gains(points, sides, colours, lenses, images, depths, r, c, radius)
+    h, g = np.zeros((6, 6)), np.zeros(6)
+    p, at, px, row, e = np.zeros(9), np.zeros(6), np.zeros(9), np.zeros(6), np.zeros(3)
+    for n in range(points.shape[0]):
+        _place(points, n, r, c, p)
+        for v in range(lenses.shape[0]):
+            lens = lenses[v]
+            cosine, distance = _facing(lens, p)
+            if cosine < 0.2 or not _project(lens, p[0], p[1], p[2], at):
+                continue
+            if distance > depths[v, int(at[1]), int(at[0])] + 0.3 * radius:
+                continue
+            _sample(images[v], at[0], at[1], px)
+            size = 0.0
+            for k in range(3):
+                e[k] = px[k] - gains[sides[n]] * colours[n, k]
+                size += e[k] * e[k]
+            weight = cosine / (1 + size / scale**2) ** 2
             zi = 1 / at[4]
             # d(u, v)/d(point in camera axes), the lens' distortion left out of the derivative
             ux, uz = lens[12] * zi, -lens[12] * at[2] * zi * zi
@@ -108,12 +159,17 @@ def _step(
                 jy = a * lens[1] + b * lens[4] + d * lens[7]
                 jz = a * lens[2] + b * lens[5] + d * lens[8]
                 row[0], row[1], row[2] = jx * radius, jy * radius, jz * radius
-                row[3], row[4], row[5] = qy * jz - qz * jy, qz * jx - qx * jz, qx * jy - qy * jx
-                e = px[k] - colours[n, k]
+                row[3], row[4], row[5] = p[4] * jz - p[5] * jy, p[5] * jx - p[3] * jz, p[3] * jy - p[4] * jx
                 for i in range(6):
-                    g[i] += weight * row[i] * e
+                    g[i] += weight * row[i] * e[k]
                     for j in range(i + 1):
                         h[i, j] += weight * row[i] * row[j]
+    return _solved(h, g, r, c, radius)
+
+
+@njit(cache=True, fastmath=True)
+def _solved(h: _F64, g: _F64, r: _F64, c: _F64, radius: float) -> bool:
+    """Take the damped step of a normal equation; False if it is negligible or nothing holds it."""
     trace = 0.0
     for i in range(6):
         trace += h[i, i]
@@ -139,6 +195,7 @@ def _step(
 @njit(cache=True, fastmath=True)
 def _score(
     points: _F64,
+    sides: _I64,
     colours: _F32,
     lenses: _F64,
     images: _F32,
@@ -151,35 +208,31 @@ def _score(
     block: int,
 ) -> float:
     """Mean capped colour error of the visible points plus the part of the target pixels that stay uncovered."""
+    gains = _gains(points, sides, colours, lenses, images, depths, r, c, radius)
     error, total, uncovered, wanted = 0.0, 0.0, 0.0, 0.0
-    at, px = np.zeros(6), np.zeros(9)
+    p, at, px = np.zeros(9), np.zeros(6), np.zeros(9)
     for v in range(lenses.shape[0]):
         lens = lenses[v]
-        rows, cols = int(lens[21]) // block + 1, int(lens[22]) // block + 1
-        covered = np.zeros((rows, cols), np.uint8)
+        covered = np.zeros((int(lens[21]) // block + 1, int(lens[22]) // block + 1), np.uint8)
         for n in range(points.shape[0]):
-            x = r[0, 0] * points[n, 0] + r[0, 1] * points[n, 1] + r[0, 2] * points[n, 2] + c[0]
-            y = r[1, 0] * points[n, 0] + r[1, 1] * points[n, 1] + r[1, 2] * points[n, 2] + c[1]
-            z = r[2, 0] * points[n, 0] + r[2, 1] * points[n, 1] + r[2, 2] * points[n, 2] + c[2]
-            nx = r[0, 0] * points[n, 3] + r[0, 1] * points[n, 4] + r[0, 2] * points[n, 5]
-            ny = r[1, 0] * points[n, 3] + r[1, 1] * points[n, 4] + r[1, 2] * points[n, 5]
-            nz = r[2, 0] * points[n, 3] + r[2, 1] * points[n, 4] + r[2, 2] * points[n, 5]
-            vx, vy, vz = x - lens[23], y - lens[24], z - lens[25]
-            dist = math.sqrt(vx * vx + vy * vy + vz * vz)
-            cosine = -(nx * vx + ny * vy + nz * vz) / dist
-            if cosine < 0.1 or not _project(lens, x, y, z, at):
+            _place(points, n, r, c, p)
+            cosine, distance = _facing(lens, p)
+            if cosine < 0.1 or not _project(lens, p[0], p[1], p[2], at):
                 continue
             i, j = int(at[1]), int(at[0])
             covered[i // block, j // block] = 1
-            if cosine < 0.2 or dist > depths[v, i, j] + 0.3 * radius:
+            if cosine < 0.2 or distance > depths[v, i, j] + 0.3 * radius:
                 continue
             total += cosine
             if targets[v, i, j] < 0:  # certainly unchanged: nothing can be in front here
                 error += cosine
                 continue
             _sample(images[v], at[0], at[1], px)
-            e = (px[0] - colours[n, 0]) ** 2 + (px[1] - colours[n, 1]) ** 2 + (px[2] - colours[n, 2]) ** 2
-            error += cosine * min(1.0, e / cap**2)
+            e, gain = 0.0, gains[sides[n]]
+            for k in range(3):
+                e += (px[k] - gain * colours[n, k]) ** 2
+            # a side may be lit differently, but the less the better
+            error += cosine * min(1.0, e / cap**2 + 0.25 * math.log(gain) ** 2)
         for i in range(int(lens[21])):
             for j in range(int(lens[22])):
                 t = targets[v, i, j]
@@ -195,6 +248,7 @@ def _score(
 @njit(cache=True, parallel=True, fastmath=True)
 def register_all(
     points: _F64,
+    sides: _I64,
     colours: _F32,
     lenses: _F64,
     images: _F32,
@@ -208,11 +262,16 @@ def register_all(
     radius: float,
     block: int,
 ) -> _F64:
-    """Improve K poses by ``steps`` steps each and score them: rotations (K, 3, 3), centres (K, 3) in place -> (K,)."""
+    """Improve K poses by ``steps`` steps each and score them: rotations (K, 3, 3), centres (K, 3) in place -> (K,).
+
+    points (N, 6): position and normal; sides (N,) the side of the object each is on; colours (N, 3); images
+    (V, H, W, 9): colour and its derivatives; depths, targets (V, H, W).
+    """
     out = np.zeros(rotations.shape[0])
     for k in prange(rotations.shape[0]):
+        r, c = rotations[k], centres[k]
         for _ in range(steps):
-            if not _step(points, colours, lenses, images, depths, rotations[k], centres[k], scale, radius):
+            if not _step(points, sides, colours, lenses, images, depths, r, c, scale, radius):
                 break
-        out[k] = _score(points, colours, lenses, images, depths, targets, rotations[k], centres[k], cap, radius, block)
+        out[k] = _score(points, sides, colours, lenses, images, depths, targets, r, c, cap, radius, block)
     return out

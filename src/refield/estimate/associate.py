@@ -20,7 +20,7 @@ from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.light import even_and_grey, log_ratio
 from refield.estimate.look import Array, View
 from refield.estimate.matched import matched_poses
-from refield.estimate.objects import Old
+from refield.estimate.objects import ObjectConfig, Old, restricted
 from refield.estimate.past import Past, changed_share, gone_score, look_past
 from refield.estimate.pose_change import PoseChange, RefineConfig, object_alone, refine, refiner
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
@@ -49,6 +49,8 @@ class AssociateConfig:
     """part of a newcomer's pixels that nothing else explains"""
     newcomer: float = 0.01
     """part of a photo that something new must fill in at least one of them (the paper's contour area, §10.2.2)"""
+    trim: float = 0.03
+    """part of an object's voxels that the new photos deny, from which on it is trimmed"""
     still: float = 1.2
     """pixels; what moved by less stayed"""
     most: int = 5
@@ -70,6 +72,7 @@ class Ground:
     survey: Sequence[View]
     detect: DetectConfig
     carving: HullConfig
+    shape: ObjectConfig
     believe: AssociateConfig
     search: RegisterConfig
     fine: RefineConfig
@@ -85,13 +88,16 @@ class Settled:
     """by index of the old object: part of its pixels that show what was behind"""
     arrived: tuple[Voxels, ...] = ()
     views: tuple[Past, ...] = ()
+    olds: tuple[Old, ...] = ()
+    """the old objects, those that were found again without what cannot be theirs"""
 
 
 def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> Settled:
     """Find each old object's new place or that it left, and what else arrived."""
     touched = [k for k, old in enumerate(olds) if changed_share(changed, old) >= ground.believe.touched]
     views = look_past(ground.field, changed, ground.survey, [olds[k] for k in touched], ground.detect)
-    moved, views = _place_all(ground, {k: olds[k] for k in touched}, views)
+    moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, views)
+    olds = [placed.get(k, old) for k, old in enumerate(olds)]
     removed = {}
     for k in touched:
         if k not in moved:
@@ -106,10 +112,12 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
     gone = [olds[k] for k in kept]
     arrived = [p for p in newcomers(ground, arrivals(ground, views, gone), views) if _substantial(ground, p, views)]
     moved = {k: c for k, c in moved.items() if _noticeable(olds[k], c, ground.believe.still)}
-    return Settled(moved, removed, tuple(arrived), tuple(views))
+    return Settled(moved, removed, tuple(arrived), tuple(views), tuple(olds))
 
 
-def _place_all(ground: Ground, olds: dict[int, Old], views: list[Past]) -> tuple[dict[int, PoseChange], list[Past]]:
+def _place_all(
+    ground: Ground, olds: dict[int, Old], views: list[Past]
+) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:
     """Place the old objects that fit somewhere, the best first, taking each off the photos."""
     moved: dict[int, PoseChange] = {}
     guesses = {k: matched_poses(old, views, ground.survey) for k, old in list(olds.items())[: ground.believe.most]}
@@ -124,10 +132,10 @@ def _place_all(ground: Ground, olds: dict[int, Old], views: list[Past]) -> tuple
         }
         sure = [(score, k, change) for k, (score, change) in fits.items() if change is not None]
         if not sure:
-            return moved, views
+            return moved, views, olds
         _, k, change = min(sure, key=lambda s: s[0])
-        moved[k] = change
-        views = take_off(ground.field, views, olds[k], change)
+        olds[k], moved[k] = trimmed(ground, olds[k], everyone, views, change)
+        views = take_off(ground.field, views, olds[k], moved[k])
 
 
 def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> Voxels:
@@ -236,6 +244,32 @@ def best_fit(
     if best is not None and (best.explained < believe.explains or best.explained < best.before + believe.gains):
         best = None
     return (found[0].score if found else 2.0), best
+
+
+def trimmed(
+    ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past], change: PoseChange
+) -> tuple[Old, PoseChange]:
+    """The object without what the photos show not to be at its new place (the projection check, §10.2.4, on new photos).
+
+    What no old view saw behind an object counts as solid; the new photos may look at its other side.
+    """
+    places = old.lattice.centres[old.voxels]
+    now = transform(change.new_from_old, torch.from_numpy(places)).numpy()
+    seen = [
+        (replace(p.view, depth=p.depth), pixels.dilate(p.changed.mask | p.changed.light | p.covered | ~p.known, 2))
+        for p in past
+    ]
+    _, against = votes(now, seen, ground.carving)
+    if (against > 0).mean() < ground.believe.trim:
+        return old, change
+    voxels = old.voxels.copy()
+    voxels[voxels] = against == 0
+    parts = components(voxels, 30)
+    if not parts or parts[0].sum() < 0.25 * len(places):
+        return old, change
+    smaller = restricted(old, parts[0], ground.shape)
+    again = refine(refiner(ground.field, smaller, past, olds, change.new_from_old, ground.fine), change.new_from_old)
+    return (smaller, again) if again.explained > change.explained - 0.02 else (old, change)
 
 
 def take_off(field: Field, past: Sequence[Past], old: Old, change: PoseChange) -> list[Past]:

@@ -29,8 +29,10 @@ class DetectConfig:
     """pixels of misalignment forgiven"""
     floor: float = 4.0
     """Lab units; a smaller difference is never a change"""
-    noise_quantile: float = 0.995
-    """of the differences on old photos; what the field gets wrong anyway"""
+    noise_quantile: float = 0.97
+    """of the differences on old photos; what is larger may be part of a change"""
+    seed_quantile: float = 0.995
+    """of the differences on old photos; a change is larger than this, and a third, somewhere"""
     local_factor: float = 2.5
     """a change exceeds the error that old photos show at the same surface by this factor"""
     otsu_share: float = 0.6
@@ -113,13 +115,14 @@ def changes(views: Sequence[View], survey: Sequence[Changed], config: DetectConf
     diffs = [difference(v, config) for v in views]
     known = np.concatenate([s.difference.ravel() for s in survey]) if survey else np.zeros(1)
     level = max(config.floor, float(np.quantile(known, config.noise_quantile)))
+    seed_level = max(1.3 * config.floor, 1.3 * float(np.quantile(known, config.seed_quantile)))
     above = np.concatenate([d[d > level] for d in diffs])
-    seed_level = max(1.3 * level, config.otsu_share * pixels.otsu(above, 60.0)) if len(above) else level
+    seed_level = max(seed_level, config.otsu_share * pixels.otsu(above, 60.0)) if len(above) else seed_level
     out = []
     for view, diff in zip(views, diffs):
         threshold = np.maximum(level, config.local_factor * noise_at(view, survey)).astype(np.float32)
         smallest = max(6, config.smallest * diff.size)
         mask = pixels.keep_components(diff > threshold, smallest, diff > np.maximum(seed_level, threshold))
-        mask = pixels.fill_holes(pixels.close(mask, 3), 8 * smallest)
+        mask = pixels.fill_holes(pixels.close(mask, 2 * round(0.012 * view.camera.width) + 3), 8 * smallest)
         out.append(Changed(view, diff, threshold, mask, np.zeros_like(mask)))
     return out

@@ -35,6 +35,8 @@ class ObjectConfig:
     """looked along, over all old views together"""
     through: float = 0.05
     """a voxel is empty if more than this part of the old views that look at it look through it"""
+    changed: float = 0.5
+    """part of an object's voxels that must be seeds for it to be taken whole"""
     points: int = 1500
     """on the coloured surface"""
 
@@ -235,19 +237,30 @@ def _thinned(points: Array, colours: Array, facing: Array, count: int) -> Cloud:
     return Cloud(*(np.ascontiguousarray(a[keep], np.float32) for a in (xyz, points[:, 3:], colours)))
 
 
+@dataclass(frozen=True)
+class Seeds:
+    """What is known of an object before its shape is."""
+
+    lattice: Lattice
+    changed: Voxels
+    """in the change hull and solid in the old field: certainly part of it"""
+    hull: Voxels
+    """in the change hull: it may be part of it"""
+    unchanged: Voxels
+    """some new view shows it as it was: hardly part of it"""
+
+
 def outline(
-    field: Field, frames: Sequence[Frame], seeds: tuple[Lattice, Voxels], planes: Sequence[Plane], config: ObjectConfig
+    field: Field, frames: Sequence[Frame], seeds: Seeds, planes: Sequence[Plane], config: ObjectConfig
 ) -> Old | None:
     """The whole object that the changed voxels belong to, or None if no old view shows one.
 
     Args:
-        seeds: a lattice and the voxels on it that changed and were solid.
         planes: what the object may stand on or lean against; not part of it.
     """
-    corners_lo = seeds[0].centres[seeds[1]].min(0)
-    corners_hi = seeds[0].centres[seeds[1]].max(0)
-    middle, half = (corners_lo + corners_hi) / 2, (corners_hi - corners_lo) / 2
-    half = np.maximum(half * config.box, half + 3 * seeds[0].cell)
+    places = seeds.lattice.centres[seeds.changed]
+    middle, half = (places.min(0) + places.max(0)) / 2, (places.max(0) - places.min(0)) / 2
+    half = np.maximum(half * config.box, half + 3 * seeds.lattice.cell)
     low, high = middle - half, middle + half
     patches = look_around(field, frames, corners_of(low, high), config.rays)
     if not patches:
@@ -257,18 +270,30 @@ def outline(
     free = np.ones(lattice.shape, bool)
     for plane in planes:
         free &= plane.height(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
-    solid &= free
-    start = seeds[0].holds(grown(seeds[1], 1), lattice.centres) & solid
-    parts = [
-        p for p in components(solid, 30) if (p & start).sum() > 0.3 * start.sum() or (p & start).sum() > 0.4 * p.sum()
-    ]
-    if not parts:
+    voxels = _connected(lattice, solid & free, seeds, config)
+    if not voxels.any():
         return None
-    voxels = np.logical_or.reduce(parts)
     voxels = ndimage.binary_fill_holes(voxels)
     cloud = surface_cloud(lattice, voxels, patches, config.points)
-    margin = int(np.clip(round(field.sampler.step / lattice.cell), 1, 4))
-    return Old(lattice, voxels, free, cloud, tuple(patches), margin) if len(cloud.points) >= 30 else None
+    return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= 30 else None
+
+
+def _connected(lattice: Lattice, solid: Voxels, seeds: Seeds, config: ObjectConfig) -> Voxels:
+    """The solid parts that the seeds belong to; less and less of them if they reach far beyond what changed.
+
+    An object that stands free is taken whole, also where its change was not noticed. One that runs into others (or into
+    what no old view sees) loses first what certainly did not change, then all that is not in the change hull.
+    """
+    start = seeds.lattice.holds(grown(seeds.changed, 1), lattice.centres)
+    kept = ~seeds.lattice.holds(seeds.unchanged, lattice.centres)
+    hull = seeds.lattice.holds(grown(seeds.hull, 1), lattice.centres)
+    for allowed in (solid, solid & kept, solid & hull):
+        here = start & allowed
+        parts = [p for p in components(allowed, 30) if (p & here).sum() > min(0.3 * here.sum(), 0.4 * p.sum())]
+        voxels = np.logical_or.reduce(parts) if parts else np.zeros_like(solid)
+        if (voxels & here).sum() > config.changed * voxels.sum():
+            break
+    return voxels
 
 
 def restricted(old: Old, voxels: Voxels, config: ObjectConfig) -> Old:

@@ -399,9 +399,17 @@ def _explained(r: Refiner, pose: Tensor) -> tuple[float, float, int]:
         shown = r.show(crop, pose)
         here = (shown.opacity > 0.8).reshape(crop.shape).numpy()
         photo, limit = crop.photo.reshape(*crop.shape, 3).numpy(), crop.threshold.reshape(crop.shape).numpy() * 1.5
-        new = pixels.colour_difference(photo, shown.rgb.reshape(*crop.shape, 3).numpy(), 1)
+        relit = _relit(shown.rgb.reshape(*crop.shape, 3).numpy(), photo, here, r.config.shading * r.apparent)
+        new = pixels.colour_difference(photo, relit, 1)
         old = pixels.colour_difference(photo, crop.unchanged.reshape(*crop.shape, 3).numpy(), 1)
         with_it += int((here & (new < limit)).sum())
         without += int((here & (old < limit)).sum())
         count += int(here.sum())
     return with_it / max(count, 1), without / max(count, 1), count
+
+
+def _relit(rgb: Array, photo: Array, here: Array, sigma: float) -> Array:
+    """``rgb`` with the object's smooth brightness taken from the photo, within a factor of two: it may have turned."""
+    weight = here.astype(np.float32)
+    light = pixels.blur(photo.mean(-1) * weight, sigma) / np.maximum(pixels.blur(rgb.mean(-1) * weight, sigma), 1e-4)
+    return rgb * np.where(here, np.clip(light, 0.5, 2.0), 1.0)[..., None].astype(np.float32)

@@ -16,7 +16,7 @@ from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.hull import Hull, HullConfig, Plane
 from refield.estimate.lattice import Lattice, Voxels, components
 from refield.estimate.look import Array, View
-from refield.estimate.objects import ObjectConfig, Old
+from refield.estimate.objects import ObjectConfig, Old, Seeds
 from refield.estimate.pose_change import PoseChange, RefineConfig
 from refield.estimate.register import RegisterConfig
 from refield.field.radiance import Field
@@ -96,12 +96,12 @@ def estimate_change(
     say("pose")
     up = scene.planes[0].normal if scene.planes else _up(capture)
     ground = Ground(
-        field, carved, free, up, scene.planes, scene.survey, config.detect, config.hull, config.associate, config.register,
-        config.refine,
+        field, carved, free, up, scene.planes, scene.survey, config.detect, config.hull, config.objects,
+        config.associate, config.register, config.refine,
     )  # fmt: skip
     settled = associate.settle(ground, olds, scene.changed)
     say("segment")
-    return _concluded(scene, photos, olds, settled, carved)
+    return _concluded(scene, photos, settled.olds, settled, carved)
 
 
 def _detected(capture: Capture, field: Field, frames: Sequence[Frame], config: EstimateConfig) -> _Scene:
@@ -152,7 +152,8 @@ def _were_there(scene: _Scene, carved: Hull, free: Voxels) -> list[Old]:
     for part in components(carved.hull & carved.solid & free, config.hull.smallest)[: config.associate.most]:
         if any(old.lattice.holds(old.voxels, carved.lattice.centres[part]).mean() > 0.5 for old in found):
             continue
-        old = objects.outline(scene.field, scene.capture.train, (carved.lattice, part), scene.planes, config.objects)
+        seeds = Seeds(carved.lattice, part, carved.hull, carved.unchanged)
+        old = objects.outline(scene.field, scene.capture.train, seeds, scene.planes, config.objects)
         if old is not None:
             found.append(old)
     return found

@@ -26,7 +26,7 @@ from refield.scene.capture import Capture, Frame, Rays
 class FitConfig:
     """Pre-training (§10.1.1)."""
 
-    steps: int = 2500
+    steps: int = 2000
     """of gradient descent"""
     max_seconds: float | None = None
     """stop in time: the learning rate follows whichever of steps and seconds is further on"""

@@ -86,7 +86,7 @@ class OccupancyTrainer:
         for _ in range(2):
             for cells in everything[opaque].split(1 << 18):
                 self.opacity[cells] = torch.maximum(self.opacity[cells], self._probe(cells))
-        keep = self.opacity > _OPACITY
+        keep = self.opacity > min(_OPACITY, float(self.opacity.mean()))
         self._set(keep)
         seen = torch.zeros_like(self.weight)
         chosen = torch.randperm(len(pixels))[:rays]

@@ -1,4 +1,4 @@
-"""Exact stand-ins at each seam (DESIGN §4): a field, a segmenter and a matcher that know the world.
+"""Exact stand-ins at each seam: a field, a segmenter and a matcher that know the world.
 
 They need no renderer. Colours are the textures themselves, without light.
 """
@@ -29,7 +29,7 @@ class AnalyticField:
     """A state as a Field: density rises from 0 on each surface to its full value ``depth`` inside it.
 
     Nothing leaks outside the solids, so a solid's grid holds all of its density. The light is none: an object
-    looks the same wherever it is, which makes the commuting square (DESIGN §7) exact.
+    looks the same wherever it is, which makes the commuting square exact.
     """
 
     def __init__(self, state: State, *, depth: float = 0.01, sigma: float = 600.0, resolution: int = 192) -> None:

@@ -54,7 +54,7 @@ def otsu(values: Image, top: float) -> float:
     """Otsu's threshold of values in [0, top]; larger ones count as ``top``."""
     grey = np.clip(values.reshape(1, -1) * (255 / top), 0, 255).astype(np.uint8)
     level, _ = cv2.threshold(grey, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
-    return float(level) * top / 255
+    return (float(level) + 1) * top / 255  # the upper edge of the last grey level below
 
 
 def dilate(mask: Mask, pixels: int = 1) -> Mask:
