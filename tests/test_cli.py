@@ -137,10 +137,7 @@ def test_updates_stack(place, monkeypatch, capsys):
             assert (visit / name).is_file(), name
     shown = []
     for n in (0, 1, 2):
-        assert (
-            main(["render", "work", "--cameras", "new/transforms.json", "--out", f"v{n}", "--visit", f"{n}"])
-            == 0
-        )
+        assert main(["render", "work", "--cameras", "new/transforms.json", "--out", f"v{n}", "--visit", f"{n}"]) == 0
         shown.append(torch.stack([read_image(place / f"v{n}/00{i}.png").float() for i in range(4)]))
     assert main(["render", "work", "--cameras", "new/transforms.json", "--out", "latest"]) == 0
     assert torch.equal(read_image(place / "latest/000.png"), read_image(place / "v2/000.png"))

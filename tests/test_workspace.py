@@ -6,21 +6,12 @@ import pytest
 import torch
 
 from refield.artefacts import TENSORS, locked, read_tensors, write_tensors
-from refield.field.encoding import Contraction
-from refield.field.radiance import HashField, HashFieldConfig
-from refield.field.sampling import OccupancySampler
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
 from refield.workspace import Workspace
 from tests.captures import CAMERA, write_capture
+from tests.fields import small_field
 from tests.folders import contents
-
-
-def small_field() -> HashField:
-    grid = torch.ones(16, 16, 16, dtype=torch.uint8)
-    sampler = OccupancySampler(Contraction(torch.zeros(3), 1.5), grid, 0.1)
-    config = HashFieldConfig(levels=2, coarsest=4, finest=8, log2_table=8, width=8)
-    return HashField(config, sampler).eval().requires_grad_(False)
 
 
 @pytest.fixture

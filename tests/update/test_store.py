@@ -6,10 +6,7 @@ import pytest
 import torch
 
 from refield.artefacts import read_tensors, write_tensors
-from refield.field.encoding import Contraction
-from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_rays
-from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Rays
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.errors import InputError
@@ -17,19 +14,9 @@ from refield.scene.pose import exp
 from refield.update.composite import UpdatedField
 from refield.update.light import Relighting
 from refield.update.store import load_updated, save_updated
+from tests.fields import small_field
 
 STORED = {"pretrained", "change", "helper", "region", "light", "shading", "sampler"}
-
-
-def small_field(seed: int) -> HashField:
-    g = torch.Generator().manual_seed(seed)
-    grid = (torch.rand(16, 16, 16, generator=g) > 0.3).to(torch.uint8)
-    sampler = OccupancySampler(Contraction(torch.zeros(3), 1.0), grid, 0.1)
-    config = HashFieldConfig(levels=3, coarsest=4, finest=16, log2_table=10, width=8)
-    field = HashField(config, sampler, seed)
-    with torch.no_grad():
-        field.encoding.tables.normal_(generator=g)
-    return field.eval().requires_grad_(False)
 
 
 def a_light(seed: int) -> Relighting:
