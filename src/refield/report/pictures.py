@@ -40,11 +40,10 @@ def with_masks(photo: Tensor, mask_in: Tensor | None, mask_out: Tensor | None) -
     image = _unit(photo)
     grey = (image @ torch.tensor([0.299, 0.587, 0.114]))[..., None]
     out = (0.75 * grey + 0.25).expand(*image.shape).clone()
-    for mask, colour in ((mask_out, OUT_COLOUR), (mask_in, IN_COLOUR)):
-        if mask is None:
-            continue
-        ink = torch.tensor(colour) / 255
+    inked = [(m, torch.tensor(c) / 255) for m, c in ((mask_in, IN_COLOUR), (mask_out, OUT_COLOUR)) if m is not None]
+    for mask, ink in inked:
         out[mask] = 0.5 * image[mask] + 0.5 * ink
+    for mask, ink in inked:
         out[_outline(mask)] = ink
     return out
 
