@@ -168,6 +168,23 @@ def _step(
 
 
 @njit(cache=True, fastmath=True)
+def _minus_solution(h: _F64, g: _F64) -> _F64:
+    """-h⁻¹ g for a positive h (6, 6), by Gauss's elimination; numpy's costs seconds to compile."""
+    s = -g
+    for i in range(6):
+        for j in range(i + 1, 6):
+            f = h[j, i] / h[i, i]
+            for k in range(i, 6):
+                h[j, k] -= f * h[i, k]
+            s[j] -= f * s[i]
+    for i in range(5, -1, -1):
+        for k in range(i + 1, 6):
+            s[i] -= h[i, k] * s[k]
+        s[i] /= h[i, i]
+    return s
+
+
+@njit(cache=True, fastmath=True)
 def _solved(h: _F64, g: _F64, r: _F64, c: _F64, radius: float) -> bool:
     """Take the damped step of a normal equation; False if it is negligible or nothing holds it."""
     trace = 0.0
@@ -179,7 +196,7 @@ def _solved(h: _F64, g: _F64, r: _F64, c: _F64, radius: float) -> bool:
         return False
     for i in range(6):
         h[i, i] += 0.02 * h[i, i] + 1e-3 * trace
-    s = -np.linalg.solve(h, g)
+    s = _minus_solution(h, g)
     size = math.sqrt(s[0] ** 2 + s[1] ** 2 + s[2] ** 2 + s[3] ** 2 + s[4] ** 2 + s[5] ** 2)
     if size > 0.35:
         s *= 0.35 / size

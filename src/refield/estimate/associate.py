@@ -25,7 +25,7 @@ from refield.estimate.past import Past, changed_share, gone_score, look_past
 from refield.estimate.pose_change import PoseChange, RefineConfig, object_alone, refine, refiner
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
 from refield.field.radiance import Field
-from refield.scene.pose import transform
+from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
 
@@ -111,6 +111,9 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
             views = take_off(ground.field, views, olds[k], change)
     gone = [olds[k] for k in kept]
     arrived = [p for p in newcomers(ground, arrivals(ground, views, gone), views) if _substantial(ground, p, views)]
+    still = torch.eye(4, dtype=torch.float64)
+    places = [(olds[k], still) for k in kept] + [(olds[k], c.new_from_old) for k, c in moved.items()]
+    arrived = [p for p in arrived if not any(_rim_of(ground, p, old, place) for old, place in places)]
     moved = {k: c for k, c in moved.items() if _noticeable(olds[k], c, ground.believe.still)}
     return Settled(moved, removed, tuple(arrived), tuple(views), tuple(olds))
 
@@ -177,6 +180,20 @@ def _substantial(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
     """Whether a would-be newcomer is large enough in some photo; what is left over at the edge of others is not."""
     shadows = [shadow_of(p.view, ground.hull.lattice, part) & p.open for p in past]
     return max(float(s.mean()) for s in shadows) >= ground.believe.newcomer
+
+
+def _rim_of(ground: Ground, part: Voxels, old: Old, new_from_old: Tensor) -> bool:
+    """Whether a small would-be newcomer hugs an object's old or new place: a contact shadow, the rest of an outline."""
+    lattice = ground.hull.lattice
+    points = torch.from_numpy(lattice.centres[part])
+    if len(points) * lattice.cell**3 > 0.2 * old.volume:
+        return False
+    back = transform(invert(new_from_old), points).numpy()
+    reach = max(2, round(0.35 * old.radius / old.lattice.cell))
+    near = ndimage.distance_transform_edt(~np.pad(old.voxels, reach)) <= reach
+    ijk = np.floor((back - old.lattice.low) / old.lattice.cell).astype(int) + reach
+    inside = ((ijk >= 0) & (ijk < near.shape)).all(-1)
+    return float(near[tuple(ijk[inside].T)].sum()) > 0.5 * len(points)
 
 
 def _only_light(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:

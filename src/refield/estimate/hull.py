@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from refield.estimate.detect import Changed, Mask
 from refield.estimate.lattice import Lattice, Voxels
@@ -31,6 +32,8 @@ class HullConfig:
     """pixels the change masks are grown by before carving"""
     surface: float = 1.5
     """pixels; a point this close to the old surface is on it"""
+    convincing: float = 0.06
+    """clusters for which less than this part of the strongest's difference speaks are left out"""
     smallest: int = 40
     """voxels; smaller parts are dropped"""
 
@@ -106,9 +109,37 @@ def find_region(changed: Sequence[Changed], config: HullConfig) -> Lattice | Non
     points = np.concatenate(kept) if kept else np.zeros((0, 3), np.float32)
     if len(points) < 20:
         return None
+    points = _convincing(points, changed, config)
     low, high = np.quantile(points, 0.002, axis=0), np.quantile(points, 0.998, axis=0)
     pad = 0.06 * float((high - low).max())
     return Lattice.over((low - pad).astype(np.float32), (high + pad).astype(np.float32), config.longest)
+
+
+def _convincing(points: Array, changed: Sequence[Changed], config: HullConfig) -> Array:
+    """The points without clusters that hardly any difference speaks for: a poor field's errors meet far away."""
+    lattice = Lattice.over(points.min(0), points.max(0), 48)
+    ijk, _ = lattice.index(points)
+    filled = np.zeros(lattice.shape, bool)
+    filled[tuple(ijk.T)] = True
+    labels, count = ndimage.label(filled, np.ones((3, 3, 3)))
+    owner = labels[tuple(ijk.T)]
+    mass = np.array([_mass(points[owner == k], changed) for k in range(1, count + 1)])
+    keep = np.concatenate([[False], mass > config.convincing * mass.max()])
+    return points[keep[owner]]
+
+
+def _mass(points: Array, changed: Sequence[Changed]) -> float:
+    """Colour difference under a cluster, summed over pixels and views, less if some views that look there see none."""
+    mass, agree, asked = 0.0, 0.0, 0.0
+    for c in changed:
+        uv, _, inside = c.view.project(points)
+        on = np.zeros(c.view.shape, bool)
+        ij = uv[inside].astype(np.int64)
+        on[ij[:, 1], ij[:, 0]] = True
+        mass += float(c.difference[on & c.mask].sum()) / (c.view.camera.width * c.view.camera.height)
+        agree += float(c.view.lookup(c.mask, uv, inside)[inside].sum())
+        asked += float(inside.sum())
+    return mass * (agree / max(asked, 1.0)) ** 2
 
 
 def _points_before_surface(c: Changed, config: HullConfig, at_most: int = 2500) -> Array:

@@ -26,12 +26,13 @@ from refield.vision.matcher import SiftMatcher
 
 Features = tuple[NDArray[np.float64], NDArray[np.float32]]
 
+_MATCHER = SiftMatcher()
 _MARGIN = 4  # pixels around the object that features are looked for in
 _CROP = 160  # pixels; what is smaller is enlarged to this before features are looked for
 
 
 def matched_poses(
-    old: Old, past: Sequence[Past], survey: Sequence[View], least: int = 8, matcher: SiftMatcher = SiftMatcher()
+    old: Old, past: Sequence[Past], survey: Sequence[View], least: int = 8, matcher: SiftMatcher = _MATCHER
 ) -> list[Tensor]:
     """``new_from_old`` (4, 4) float64 guesses, at most one a photo, each with ``least`` or more inliers."""
     sources = [(p.view.rgb, p.view) for p in past] + [(v.photo, v) for v in survey]
@@ -47,7 +48,7 @@ def matched_poses(
             index = {(float(q[0]), float(q[1])): k for k, q in enumerate(points)}
             xyz += [points[index[(float(q[0]), float(q[1]))], 2:] for q in a]
             uv += list(b)
-        pose = _pnp(np.array(uv), np.array(xyz), p.view.camera, least)
+        pose = camera_from_object(np.array(uv), np.array(xyz), p.view.camera, least)
         if pose is not None:
             out.append(p.view.frame.world_from_cam @ pose)
     return out
@@ -82,7 +83,7 @@ def _features_in(image: Array, mask: Mask, matcher: SiftMatcher) -> Features:
     return xy[inside], descriptors[inside]
 
 
-def _pnp(uv: NDArray[np.float64], xyz: NDArray[np.float64], camera: Camera, least: int) -> Tensor | None:
+def camera_from_object(uv: NDArray[np.float64], xyz: NDArray[np.float64], camera: Camera, least: int) -> Tensor | None:
     """cam_from_old (4, 4) of one photo (Eq. 8), or None."""
     if len(uv) < least:
         return None

@@ -16,7 +16,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from refield.estimate.look import load_photo, see, shaded
+from refield.estimate.look import Array, load_photo, see, shaded
 from refield.estimate.objects import Old, box_in, patch_rays
 from refield.estimate.past import Past
 from refield.field.radiance import Field

@@ -6,6 +6,7 @@ asks at ``old_from_new @ x``, along the direction turned back by the same rotati
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -88,6 +89,39 @@ def looked_up(x: Tensor, d: Tensor, owner: Tensor, poses: list[Tensor]) -> tuple
             x = x.index_copy(0, mine, transform(pose, x[mine]))
             d = d.index_copy(0, mine, rotate(pose, d[mine]))
     return x, d
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """The directions along which an object was looked at when its field was fitted."""
+
+    directions: Tensor
+    """(C, 3) unit, from the cameras to the object"""
+    reach: float
+    """Radians around each of them within which the field may be asked"""
+
+    @staticmethod
+    def from_eyes(eyes: Tensor, centre: Tensor) -> Outlook:
+        """Camera centres (C, 3), the object's centre (3,). The reach is half the cameras' usual spacing."""
+        d = torch.nn.functional.normalize(centre - eyes, dim=-1)
+        if len(d) < 2:
+            return Outlook(d, 0.0)
+        nearest = (d @ d.T).fill_diagonal_(-1).amax(-1).clamp(-1, 1).acos()
+        return Outlook(d, 0.5 * float(nearest.median()))
+
+    def held(self, d: Tensor) -> Tensor:
+        """Directions (S, 3), those out of reach replaced by the nearest within it.
+
+        What a fitted colour says along directions that no photo looked along is accidental; a tipped object is asked
+        from below, where nobody was.
+        """
+        cosine, nearest = (d.detach() @ self.directions.T).max(-1)
+        out = (cosine < math.cos(self.reach)).nonzero()[:, 0]
+        if len(out) == 0:
+            return d
+        axis = self.directions[nearest[out]]
+        across = torch.nn.functional.normalize(d[out] - (d[out] * axis).sum(-1, keepdim=True) * axis, dim=-1)
+        return d.index_copy(0, out, math.cos(self.reach) * axis + math.sin(self.reach) * across)
 
 
 def outline(grid: OccupancyGrid) -> Tensor:

@@ -16,11 +16,11 @@ from refield.field.radiance import Field, HashField
 from refield.field.render import visible_samples
 from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples
-from refield.field.warp import Move, inside_box, looked_up, moves_of, owners
+from refield.field.warp import Move, Outlook, inside_box, looked_up, moves_of, outline, owners
 from refield.scene.capture import Rays
-from refield.scene.change import OccupancyGrid, SceneChange
+from refield.scene.change import SceneChange
 from refield.update.light import Relighting
-from refield.update.region import Region, carved, move_out
+from refield.update.region import Region, carved, grown, move_out
 
 DILATION = 2.0
 """M_out is the object's grid, its box this many times as large (§10.1.3: 2 to 3)."""
@@ -28,6 +28,7 @@ DILATION = 2.0
 SKIN = 1.0
 """How much further than its grid a moved object reaches, in samples of the old field"""
 
+NOWHERE = Region(())
 _SOLID = 0.05  # opacity of a sample that was not empty before
 _PROBES = 8  # points a cell looked up when the sampler is recomputed: a moved surface crosses cells at any angle
 
@@ -44,20 +45,29 @@ class UpdatedField:
         region: Region | None = None,
         light: Relighting | None = None,
         shading: tuple[Relighting | None, ...] = (),
+        eyes: Tensor | None = None,
+        bare: Region = NOWHERE,
         sampler: OccupancySampler | None = None,
     ) -> None:
-        """``region`` is where the helper speaks (M_out of the change by default); with no helper it is cut out
-        (the objects' own grids by default). ``light`` changes what stood still, ``shading`` each moved object, at its
-        old place. ``sampler`` is recomputed where things changed unless it is given."""
+        """What a visit adds to the old field.
+
+        ``region`` is where the helper speaks (M_out of the change by default); with no helper it is cut out (the
+        objects' own grids and their skin by default). ``light`` changes what stood still, ``shading`` each moved
+        object, at its old place. ``eyes`` (C, 3) are the centres of the old cameras: moved objects are not asked
+        along directions that none of them looked along. ``bare``, a part of the region, goes before what moved in.
+        ``sampler`` is recomputed where things changed unless it is given.
+        """
         self.pretrained, self.change, self.helper, self.light = pretrained, change, helper, light
-        self.shading = shading
+        self.shading, self.eyes, self.bare = shading, eyes, bare
         self.why_stopped = ""
         """what ended the helper's training, in words; empty if it was not trained here"""
         if region is None:
-            region = carved(change) if helper is None else move_out(change, DILATION)
+            region = carved(change, SKIN * pretrained.sampler.step) if helper is None else move_out(change, DILATION)
         self.region = region
         self.moves: tuple[Move, ...] = moves_of(change)
-        self._shells = tuple(Move(_grown(m.grid, SKIN * pretrained.sampler.step), m.new_from_old) for m in self.moves)
+        self._shells = tuple(Move(grown(m.grid, SKIN * pretrained.sampler.step), m.new_from_old) for m in self.moves)
+        centres = [outline(m.grid).mean(0) for m in self.moves]
+        self._outlooks = [] if eyes is None else [Outlook.from_eyes(eyes, c) for c in centres]
         self.sampler_step = pretrained.sampler.step
         self.boxes = tuple(m.box_now for m in self._shells) + region.boxes
         if sampler is None:
@@ -140,6 +150,9 @@ class UpdatedField:
         owner[near] = mover
         inside[near] = (mover < 0) & self.region.contains(x[near])
         at, along = looked_up(x[near], d[near], mover, [m.old_from_new for m in self.moves])
+        for i, outlook in enumerate(self._outlooks):
+            mine = (mover == i).nonzero()[:, 0]
+            along = along.index_copy(0, mine, outlook.held(along[mine]))
         asked, turned = x.index_copy(0, near, at), d.index_copy(0, near, along)
         return asked, turned, owner, (~inside).nonzero()[:, 0], inside.nonzero()[:, 0]
 
@@ -157,7 +170,7 @@ class UpdatedField:
             solid = self.pretrained.density(at) * self.sampler_step > _SOLID
             free = ~solid | self.region.contains(at)
             owner[rows[free]] = skin[rows[free]]
-        return owner
+        return torch.where(self.bare.contains(x), -1, owner) if self.bare.grids else owner
 
     def _near(self, x: Tensor) -> Tensor:
         near = torch.zeros(len(x), dtype=torch.bool, device=x.device)
@@ -172,12 +185,6 @@ class UpdatedField:
             if light is not None:
                 rgb = torch.where((owner == i)[:, None], light.applied(asked, rgb), rgb)
         return rgb
-
-
-def _grown(grid: OccupancyGrid, reach: float) -> OccupancyGrid:
-    """A grid grown by ``reach`` world units on every side."""
-    box = grid.tight_aabb()
-    return grid.dilated(1 + 2 * reach / float((box[1] - box[0]).mean()))
 
 
 def _base_of(field: Field) -> HashField | None:

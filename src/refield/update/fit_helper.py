@@ -52,7 +52,7 @@ class HelperTraining:
     ) -> None:
         self.helper, self.config, self.frozen = helper, config, frozen
         self.sparse, self.old, self.judge = sparse, old, judge
-        self.empty = emptiness(frozen.change, helper.sampler)
+        self.empty = emptiness(frozen.change, helper.sampler, frozen.bare)
         self.occupancy = HelperOccupancy(helper)
         self.adam = TableAdam(helper, config.rate)
         self.rays_per_step, self.bad, self.steps_done = 1024, 0, 0

@@ -12,6 +12,7 @@ from refield.field.radiance import Field, HashField, HashFieldConfig
 from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Frame
 from refield.scene.change import SceneChange
+from refield.update.region import Region
 
 _OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
 _WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
@@ -19,11 +20,20 @@ _DEPTH = 0.12  # of an object's mean side: so far inside, nothing that stood the
 
 
 def new_helper(region: OccupancySampler, frames: tuple[Frame, ...], seed: int) -> HashField:
-    """A fresh helper that looks everywhere in ``region``; its finest cells are 1.5 pixels of the nearest photo."""
+    """A fresh helper that looks everywhere in ``region``; its finest cells are 1.5 pixels of the nearest photo.
+
+    Its colours do not depend on direction: what a few photos say about that does not hold between them.
+    """
     space = region.contraction
     pixel = min(float((f.centre.float() - space.centre).norm()) / max(f.camera.fx, f.camera.fy) for f in frames)
     finest = int(min(max(4 * space.radius / (1.5 * pixel), 64), 2048))
-    return HashField(HashFieldConfig(levels=8, coarsest=16, finest=finest, log2_table=15), region, seed)
+    helper = HashField(HashFieldConfig(levels=8, coarsest=16, finest=finest, log2_table=15), region, seed)
+    learnt = torch.ones_like(helper.colour_in)
+    learnt[:, helper.config.geometry_features + 1 :] = 0  # all harmonics but the constant one
+    with torch.no_grad():
+        helper.colour_in.mul_(learnt)
+    helper.colour_in.register_hook(lambda grad: grad * learnt)
+    return helper
 
 
 def step_near(field: Field, point: Tensor) -> float:
@@ -33,11 +43,11 @@ def step_near(field: Field, point: Tensor) -> float:
     return s.step * max(reach, 1.0) ** 1.5
 
 
-def emptiness(change: SceneChange, cells: OccupancySampler) -> Tensor:
+def emptiness(change: SceneChange, cells: OccupancySampler, taken: Region) -> Tensor:
     """How deep inside an object that left each cell lies, (R**3,) float32: 0 outside and at its surface, 1 deep inside.
 
     What stood in the way of everything is not there any more; only near its surface may something else begin: the
-    ground under it, the wall behind it.
+    ground under it, the wall behind it. 0 in ``taken`` too, where something stands now.
     """
     r = cells.resolution
     depth = torch.zeros(r**3)
@@ -51,7 +61,7 @@ def emptiness(change: SceneChange, cells: OccupancySampler) -> Tensor:
         cell = 4 * cells.contraction.radius / r
         distance = torch.from_numpy(distance_transform_edt(inside.numpy())).float().reshape(-1) * cell
         depth = torch.maximum(depth, (distance / reach - 1).clamp(0, 1))
-    return depth
+    return torch.where(taken.contains(centres), 0.0, depth) if taken.grids else depth
 
 
 class HelperOccupancy:

@@ -44,10 +44,15 @@ class Region:
                 found[near] = grid.contains(flat[near])
         return found.reshape(x.shape[:-1])
 
-    def sampler(self, step: float, resolution: int = 64) -> OccupancySampler:
-        """Looks everywhere in the region and nowhere else; its core cube is the region's bounding cube."""
+    def sampler(self, step: float, resolution: int | None = None) -> OccupancySampler:
+        """Looks everywhere in the region and nowhere else; its core cube is the region's bounding cube.
+
+        Its cells are as wide as a sample is long, within what memory affords, unless ``resolution`` is given.
+        """
         box = self.box
         space = Contraction(box.mean(0), float((box[1] - box[0]).max()) / 2 * 1.02)
+        if resolution is None:
+            resolution = int(min(max(4 * space.radius / step, 64), 160))
         empty = OccupancySampler(space, torch.zeros(resolution, resolution, resolution, dtype=torch.uint8), step)
         cells = empty.cells_in(box)
         grid = empty.grid.clone()
@@ -68,6 +73,13 @@ def move_out(change: SceneChange, factor: float) -> Region:
     return Region(tuple(o.grid.dilated(factor) if factor > 1 else o.grid for o in change.objects))
 
 
-def carved(change: SceneChange) -> Region:
-    """What was inside the objects that moved or left: nothing of the old field is true there any more."""
-    return Region(tuple(o.grid for o in change.objects if o.kind != "added"))
+def carved(change: SceneChange, skin: float = 0.0) -> Region:
+    """What was inside the objects that moved or left, and within ``skin`` (world units) of them: nothing of the old
+    field is true there any more."""
+    return Region(tuple(grown(o.grid, skin) for o in change.objects if o.kind != "added"))
+
+
+def grown(grid: OccupancyGrid, reach: float) -> OccupancyGrid:
+    """A grid grown by ``reach`` world units on every side."""
+    box = grid.tight_aabb()
+    return grid if reach == 0 else grid.dilated(1 + 2 * reach / float((box[1] - box[0]).mean()))

@@ -29,10 +29,12 @@ def save_updated(folder: Path, field: UpdatedField) -> None:
     facts: dict[str, Any] = {
         "architecture": "UpdatedField",
         "regions": len(field.region.grids),
+        "bare": len(field.bare.grids),
         "helper": None,
     }
-    for i, grid in enumerate(field.region.grids):
-        tensors |= {f"region.{i}.aabb": grid.aabb, f"region.{i}.values": grid.values}
+    tensors |= _region_out("region", field.region) | _region_out("bare", field.bare)
+    if field.eyes is not None:
+        tensors["eyes"] = field.eyes
     facts["shading"] = len(field.shading)
     tensors |= _light_out("light", field.light)
     for i, light in enumerate(field.shading):
@@ -53,8 +55,8 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
     """
     tensors, facts = read_tensors(folder)
     try:
-        regions = range(facts["regions"])
-        grids = [OccupancyGrid(tensors[f"region.{i}.aabb"], tensors[f"region.{i}.values"]) for i in regions]
+        region = _region_in("region", facts["regions"], tensors)
+        bare = _region_in("bare", facts["bare"], tensors)
         light = _light_in("light", tensors)
         shading = tuple(_light_in(f"shading.{i}", tensors) for i in range(facts["shading"]))
         own = {name.removeprefix("helper."): t for name, t in tensors.items() if name.startswith("helper.")}
@@ -62,8 +64,29 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
         sampler = replace(pretrained.sampler, grid=tensors["occupancy"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(folder, f"does not describe an updated field ({error})", _REMEDY) from None
-    region = Region(tuple(grids))
-    return UpdatedField(pretrained, change, helper, region=region, light=light, shading=shading, sampler=sampler)
+    return UpdatedField(
+        pretrained,
+        change,
+        helper,
+        region=region,
+        light=light,
+        shading=shading,
+        eyes=tensors.get("eyes"),
+        bare=bare,
+        sampler=sampler,
+    )
+
+
+def _region_out(name: str, region: Region) -> dict[str, Tensor]:
+    out: dict[str, Tensor] = {}
+    for i, grid in enumerate(region.grids):
+        out |= {f"{name}.{i}.aabb": grid.aabb, f"{name}.{i}.values": grid.values}
+    return out
+
+
+def _region_in(name: str, count: int, tensors: dict[str, Tensor]) -> Region:
+    keys = [f"{name}.{i}" for i in range(count)]
+    return Region(tuple(OccupancyGrid(tensors[f"{k}.aabb"], tensors[f"{k}.values"]) for k in keys))
 
 
 def _light_out(name: str, light: Relighting | None) -> dict[str, Tensor]:

@@ -15,9 +15,10 @@ from refield.field.radiance import Field
 from refield.field.render import render_many
 from refield.field.sampling import OccupancySampler
 from refield.field.warp import outline
-from refield.scene.capture import Capture, Frame
+from refield.scene.capture import Capture, Frame, centres
 from refield.scene.change import SceneChange
 from refield.scene.pose import transform
+from refield.update.bare import bare_skin
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.fit_helper import HelperTraining, Lit, UpdateProgress
@@ -52,9 +53,13 @@ def update_field(
     say = on_stage or (lambda name: None)
     torch.manual_seed(config.seed)
     say("move")
-    cut = UpdatedField(field, change)
+    eyes = centres(capture.train).float()
+    cut = UpdatedField(field, change, eyes=eyes)
     if not change.objects or not change.frames:
         return cut
+    bare = bare_skin(cut, capture.train, change)
+    if bare.grids:
+        cut = UpdatedField(field, change, region=Region(cut.region.grids + bare.grids), eyes=eyes, bare=bare)
     say("light")
     places = places_of(change)
     changed = [changed_pixels(change, places, i, f) for i, f in enumerate(change.frames)]
@@ -62,14 +67,14 @@ def update_field(
     light = _light(sparse, field, change, changed) if config.relight else None
     shading = _shading(sparse, cut, change) if config.relight else ()
     say("supervise")
-    wide = move_out(change, config.dilation)
+    wide = Region(move_out(change, config.dilation).grids + bare.grids)
     region = _in_reach(wide.sampler(step_near(field, wide.box.mean(0))), capture.train + change.frames)
     old = _old_lessons(capture, field, places, region, config, light)
     sparse = sparse[meets(region, sparse.rays).nonzero()[:, 0]]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
     say("freeze")
-    frozen = UpdatedField(field, change, region=wide, light=light, shading=shading)
+    frozen = UpdatedField(field, change, region=wide, light=light, shading=shading, eyes=eyes, bare=bare)
     new_taught, judge = _split(Lit(sparse, composite_once(frozen, region, sparse.rays)), config.held_out)
     old_taught = Lit(old, composite_once(frozen, region, old.rays))
     say("train")
@@ -78,7 +83,7 @@ def update_field(
     run.run(on_progress)
     say("show")
     helper.requires_grad_(False)
-    updated = UpdatedField(field, change, helper, region=wide, light=light, shading=shading)
+    updated = UpdatedField(field, change, helper, region=wide, light=light, shading=shading, eyes=eyes, bare=bare)
     updated.why_stopped = run.why_stopped
     return updated
 
@@ -134,6 +139,7 @@ def _shading(sparse: Lessons, cut: UpdatedField, change: SceneChange) -> tuple[R
         patch = (asked / (float((box[1] - box[0]).mean()) / _PATCHES)).floor().long()
         fold = (patch * torch.tensor([1, 3, 5])).sum(-1).remainder(_FOLDS)
         spacing = max(float((box[1] - box[0]).mean()) / _SHADING_CELLS, 2 * _pixel(change, x.mean(0)))
+        box = torch.stack([box[0] - 3 * spacing, box[1] + 3 * spacing])  # a fit fades out at the border of its box
         out.append(fit_light(Sightings(asked, seen.rgb, now.rgb, fold)[solid], box, spacing) if len(solid) else None)
     return tuple(out)
 

@@ -1,0 +1,92 @@
+"""Carving with oracle masks returns the object; planes that hold things up are found and nothing else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from refield.estimate.detect import Changed
+from refield.estimate.hull import HullConfig, carve, find_region, support_planes
+from refield.estimate.lattice import Lattice, components
+from refield.estimate.look import median_depth, view_of
+from refield.field.volrend import Samples
+from tests.estimate.boxes import BoxWorld, camera_at, photograph, standing
+
+CRATE = standing((0.2, 0.17, 0.18), -0.1, -0.1, 20)
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory):
+    """Four views of the world with the crate, and where they show it."""
+    folder = tmp_path_factory.mktemp("photos")
+    frames = photograph(BoxWorld((CRATE,)), folder, [camera_at(20 + 90 * k, 34) for k in range(4)])
+    return [view_of(BoxWorld((CRATE,)), f, 10_000) for f in frames]
+
+
+def true_mask(view):
+    inward = torch.from_numpy(view.surface + 0.02 * view.directions)
+    return CRATE.inside(torch.nan_to_num(inward)).numpy() & np.isfinite(view.depth)
+
+
+def test_carving_with_true_masks_returns_the_object(views):
+    nothing = np.zeros(views[0].shape, bool)
+    changed = [Changed(v, nothing, nothing, true_mask(v), nothing) for v in views]
+    lattice = find_region(changed, HullConfig())
+    assert lattice is not None
+    hull = carve(lattice, [(c.view, c.mask) for c in changed], views, HullConfig())
+    inside = CRATE.inside(torch.from_numpy(lattice.centres)).numpy()
+    above = lattice.centres[..., 2] > 0
+    was = hull.hull & hull.solid & above
+    assert (was & inside).sum() > 0.95 * inside.sum()
+    assert (was & inside).sum() > 0.75 * was.sum()
+    assert not (hull.unchanged & inside).any()
+
+
+def test_no_mask_no_region(views):
+    nothing = np.zeros(views[0].shape, bool)
+    assert find_region([Changed(v, nothing, nothing, nothing, nothing) for v in views], HullConfig()) is None
+
+
+def test_the_floor_holds_up_and_the_lid_does_not(views):
+    points = np.concatenate([v.surface.reshape(-1, 3) for v in views])
+    points = points[np.isfinite(points).all(-1)]
+    cameras = np.stack([v.centre for v in views])
+    planes = support_planes(points, cameras, 0.012)
+    assert len(planes) == 1
+    np.testing.assert_allclose(planes[0].normal, [0, 0, 1], atol=0.01)
+    assert abs(planes[0].offset) < 0.01
+
+
+def test_median_depth_is_where_half_the_light_is_stopped():
+    # one ray through a slab of sigma 2 from t = 1: half is stopped ln(2) / 2 further on; one ray through nothing
+    t = torch.arange(10) * 0.1 + 1.0
+    samples = Samples(t, t + 0.1, torch.tensor([0, 10, 10]))
+    depth = median_depth(torch.full((10,), 2.0), samples)
+    assert float(depth[0]) == pytest.approx(1 + np.log(2) / 2, abs=1e-5)
+    assert torch.isinf(depth[1])
+
+
+def test_lattice_knows_what_lies_in_a_voxel():
+    lattice = Lattice.over(np.zeros(3, np.float32), np.array([1, 2, 0.5], np.float32), 20)
+    voxels = np.zeros(lattice.shape, bool)
+    voxels[3, 4, 2] = voxels[10, 10, 2] = True
+    points = lattice.centres[voxels] + 0.3 * lattice.cell
+    assert lattice.holds(voxels, points).all()
+    assert not lattice.holds(voxels, points + lattice.cell).any()
+    assert not lattice.holds(voxels, np.array([[9.0, 0, 0], [np.nan, 0, 0]])).any()
+    assert [p.sum() for p in components(voxels, 1)] == [1, 1] and components(voxels, 2) == []
+    grid = lattice.grid(voxels.astype(np.float32))
+    assert grid.contains(torch.from_numpy(lattice.centres))[3, 4, 2]
+
+
+def test_a_view_finds_its_own_surface_again(views):
+    view = views[0]
+    uv, distance, inside = view.project(view.surface)
+    seen = np.isfinite(view.depth)
+    i, j = np.nonzero(seen)
+    np.testing.assert_allclose(uv[seen], np.stack([j, i], -1) + 0.5, atol=2e-2)
+    np.testing.assert_allclose(distance[seen], view.depth[seen], rtol=1e-4)
+    assert inside[seen].all()
+    assert view.lookup(view.depth, uv, inside)[i[0], j[0]] == view.depth[i[0], j[0]]
+    assert replace(view, depth=view.depth).surface.shape == (*view.shape, 3)

@@ -1,0 +1,151 @@
+"""Poses: searched, matched and refined, against a truth that is known."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from refield.estimate import recipe
+from refield.estimate.matched import camera_from_object, matched_poses
+from refield.estimate.objects import Seeds, outline
+from refield.estimate.past import changed_share, gone_score, look_past
+from refield.estimate.pose_change import RefineConfig, object_alone, refine, refiner
+from refield.estimate.register import Target, register, super_fibonacci, turns_about
+from refield.field.render import render_camera
+from refield.scene.camera import Camera
+from refield.scene.capture import camera_rays
+from refield.scene.pose import angle_between, invert, transform
+from tests.estimate.boxes import BoxWorld, camera_at, capture_of, new_photos, standing, turn
+
+CRATE = standing((0.2, 0.17, 0.18), -0.2, -0.15, 20, paint=3)
+TRUE = turn(CRATE.world_from_box[:3, 3], 70, (0.4, 0.25, 0))
+BEFORE = BoxWorld((CRATE,))
+
+
+@dataclass
+class Stage:
+    scene: object
+    old: object
+    past: list
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory):
+    """A crate that moved, up to where its pose is asked for."""
+    folder = tmp_path_factory.mktemp("stage")
+    capture = capture_of(BEFORE, folder / "before")
+    frames = new_photos(BoxWorld((CRATE.moved(TRUE),)), folder / "after")
+    config = recipe.EstimateConfig(survey=6)
+    scene = recipe._detected(capture, BEFORE, frames, config)
+    region = recipe.hull.find_region(scene.changed, config.hull)
+    carved, free = recipe._carved(scene, region)
+    (old,) = recipe._were_there(scene, carved, free)
+    past = look_past(BEFORE, scene.changed, scene.survey, [old], config.detect)
+    return Stage(scene, old, past)
+
+
+def error(new_from_old):
+    c = CRATE.world_from_box[:3, 3]
+    return float(angle_between(new_from_old, TRUE)), float((transform(new_from_old, c) - transform(TRUE, c)).norm())
+
+
+def test_rotations_are_spread_evenly_over_all_turns():
+    r = torch.from_numpy(super_fibonacci(500))
+    torch.testing.assert_close(r @ r.mT, torch.eye(3).double().expand(500, 3, 3))
+    assert (torch.linalg.det(r) > 0.99).all()
+    to_identity = angle_between(r, torch.eye(3).double().expand(500, 3, 3))
+    assert float(to_identity.min()) < 30  # somewhere near every rotation, the identity among them
+    axis = turns_about(np.array([0, 0, 2.0]), 4)
+    np.testing.assert_allclose(axis[1] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_the_object_is_known_to_be_gone(stage):
+    assert changed_share(stage.scene.changed, stage.old) > 0.8
+    share, asked = gone_score(stage.past, stage.old)
+    assert share > 0.5 and asked > 50
+
+
+def test_registration_finds_the_turn(stage):
+    centre = transform(TRUE, CRATE.world_from_box[:3, 3]).numpy() + [0.04, -0.03, 0.03]
+    wanted = tuple((p.open * 1.0 - ~p.changed.mask).astype(np.float32) for p in stage.past)
+    best = register(stage.old.cloud, stage.past, Target(centre.astype(np.float32), wanted), np.array([0, 0, 1.0]))
+    degrees, distance = error(best[0].new_from_old)
+    assert degrees < 1.0 and distance < 0.008
+    assert best[0].score < 0.4 and all(a.score <= b.score for a, b in zip(best, best[1:]))
+
+
+def test_matched_points_give_the_pose_although_some_are_wrong():
+    """Eq. 12 with an oracle's matches."""
+    camera, world_from_cam = Camera(200, 160, 180.0, 182.0, 101, 79, k1=0.05), camera_at(30, 40)
+    g = torch.Generator().manual_seed(0)
+    old = CRATE.world_from_box[:3, 3] + (torch.rand(40, 3, generator=g, dtype=torch.float64) - 0.5) * 0.4
+    uv, _ = camera.project(transform(invert(world_from_cam), transform(TRUE, old)))
+    uv[:10] += 30
+    pose = camera_from_object(uv.numpy(), old.numpy(), camera, 8)
+    degrees, distance = error(world_from_cam @ pose)
+    assert degrees < 0.01 and distance < 1e-4
+    assert camera_from_object(uv[:6].numpy(), old[:6].numpy(), camera, 8) is None
+
+
+def test_nothing_matches_without_texture(stage):
+    grey = [replace(p, changed=replace(p.changed, view=replace(p.view, photo=p.view.photo * 0))) for p in stage.past]
+    assert matched_poses(stage.old, grey, stage.scene.survey) == []
+
+
+def test_refinement_through_the_field_improves_a_rough_pose(stage):
+    rough = turn(transform(TRUE, CRATE.world_from_box[:3, 3]), 3.0, (0.01, -0.008, 0.006), axis=(0.6, 0, 0.8)) @ TRUE
+    r = refiner(BEFORE, stage.old, stage.past, [stage.old], rough, RefineConfig())
+    found = refine(r, rough)
+    degrees, distance = error(found.new_from_old)
+    assert degrees < 0.6 and distance < 0.005
+    assert found.explained > 0.8 > found.before + 0.2
+    assert torch.linalg.eigvalsh(found.covariance).min() > 0 and found.note == ""
+
+
+def test_colour_slopes_with_respect_to_the_pose_are_those_of_finite_differences(stage):
+    """The sliding-layer derivative: same direction and size for every one of six motions."""
+    r = refiner(BEFORE, stage.old, stage.past, [stage.old], TRUE, RefineConfig())
+    now = r.residuals(TRUE, 1.5)
+    inner = now.weight > 0.5
+    for k in range(6):
+        h = 0.6 * r.pixel if k < 3 else 0.6 * r.pixel / r.old.radius
+        twist = torch.zeros(6, dtype=torch.float64)
+        twist[k] = h
+        plus, minus = (r.residuals(r.moved(TRUE, s * twist), 1.5, slopes=False).error for s in (1, -1))
+        measured = ((plus - minus) / (2 * h))[inner].reshape(-1)
+        said = now.jacobian[..., k][inner].reshape(-1)
+        cosine = float((measured * said).sum() / (measured.norm() * said.norm()))
+        assert cosine > 0.8, k
+        assert 0.6 < float(said.norm() / measured.norm()) < 1.6, k
+
+
+def test_an_object_moved_by_the_identity_is_rendered_where_it_was(stage):
+    view = stage.past[0].view
+    still = torch.eye(4, dtype=torch.float64)
+    rgb, depth, opacity = object_alone(
+        BEFORE, stage.old.grid(), camera_rays(view.camera, view.frame.world_from_cam), still
+    )
+    here = (opacity > 0.9).numpy().reshape(view.shape)
+    inward = torch.from_numpy(np.nan_to_num(view.surface + 0.02 * view.directions, posinf=9))
+    true = CRATE.inside(inward).numpy()
+    assert (here & true).sum() > 0.9 * true.sum()
+    np.testing.assert_allclose(rgb.numpy().reshape(*view.shape, 3)[here & true], view.rgb[here & true], atol=0.05)
+
+
+def test_a_moved_object_is_rendered_as_the_moved_world_shows_it(stage):
+    """The move-in half of the commuting square."""
+    after = BoxWorld((CRATE.moved(TRUE),))
+    view = stage.past[1].view
+    truth = render_camera(after, view.camera, view.frame.world_from_cam)
+    rgb, _, opacity = object_alone(BEFORE, stage.old.grid(), camera_rays(view.camera, view.frame.world_from_cam), TRUE)
+    sure = (opacity > 0.95).reshape(view.shape)
+    apart = (rgb.reshape(*view.shape, 3) - truth.rgb).abs().amax(-1)[sure]
+    assert len(apart) > 100 and float(apart.median()) < 0.05
+
+
+def test_an_outline_needs_a_view_that_shows_it(stage):
+    away = [replace(f, world_from_cam=camera_at(0, 20, radius=-2.0)) for f in stage.scene.capture.frames]
+    everywhere = np.ones(stage.old.lattice.shape, bool)
+    seeds = Seeds(stage.old.lattice, stage.old.voxels, everywhere, ~everywhere)
+    assert outline(BEFORE, away, seeds, [], recipe.ObjectConfig()) is None
