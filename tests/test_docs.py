@@ -47,9 +47,7 @@ def test_every_function_named_exists(page: Path) -> None:
 
 
 def test_every_equation_of_the_paper_has_its_place() -> None:
-    rows = [
-        line for line in (ROOT / "docs/method.md").read_text(encoding="utf-8").splitlines() if line[:1] == "|"
-    ]
+    rows = [line for line in (ROOT / "docs/method.md").read_text(encoding="utf-8").splitlines() if line[:1] == "|"]
     places: dict[int, bool] = {}
     for row in rows:
         numbers = re.match(r"\| (\d+)(?:–(\d+))? \|", row)
@@ -71,9 +69,7 @@ def test_links_between_documents_lead_somewhere(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_commands_are_real(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    shown = re.findall(r"^(?:.*/bin/)?refield (\w+)", text, re.MULTILINE) + re.findall(
-        r"`refield (\w+)", text
-    )
+    shown = re.findall(r"^(?:.*/bin/)?refield (\w+)", text, re.MULTILINE) + re.findall(r"`refield (\w+)", text)
     assert set(shown) <= set(COMMANDS)
 
 
@@ -109,11 +105,7 @@ def test_what_snippets_import_exists(name: str, source: str) -> None:
             module = importlib.import_module(node.module)
             missing = [a.name for a in node.names if not hasattr(module, a.name)]
             assert not missing, f"{name}: {node.module} has no {missing}"
-        if (
-            isinstance(node, ast.Attribute)
-            and isinstance(node.value, ast.Name)
-            and node.value.id == "refield"
-        ):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "refield":
             assert hasattr(refield, node.attr), f"{name}: refield has no {node.attr}"
 
 

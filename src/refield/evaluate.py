@@ -93,9 +93,7 @@ class Report:
         def plain(scores: Scores | None) -> dict[str, float | None] | None:
             return None if scores is None else asdict(scores)
 
-        views = [
-            {"name": v.name, "scores": plain(v.scores), "before": plain(v.scores_before)} for v in self.views
-        ]
+        views = [{"name": v.name, "scores": plain(v.scores), "before": plain(v.scores_before)} for v in self.views]
         return {
             "pooled": plain(self.pooled),
             "mean": plain(self.mean),
@@ -183,9 +181,7 @@ def _mask(folder: Path, frame: Frame) -> Tensor | None:
         return None
     path = folder / f"{stem(frame)}.png"
     if not path.is_file():
-        raise InputError(
-            path, f"there is no mask for {frame.name}", "add it, all black if nothing changed there"
-        )
+        raise InputError(path, f"there is no mask for {frame.name}", "add it, all black if nothing changed there")
     mask = read_mask(path)
     expected = (frame.camera.height, frame.camera.width)
     if tuple(mask.shape) != expected:

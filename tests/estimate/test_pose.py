@@ -1,6 +1,7 @@
 """Poses: searched, matched and refined, against a truth that is known."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -8,7 +9,6 @@ import torch
 
 from refield.estimate import recipe
 from refield.estimate.matched import camera_from_object, matched_poses
-from refield.estimate.objects import Seeds, outline
 from refield.estimate.past import changed_share, gone_score, look_past
 from refield.estimate.pose_change import RefineConfig, object_alone, refine, refiner
 from refield.estimate.register import Target, register, super_fibonacci, turns_about
@@ -67,12 +67,12 @@ def test_the_object_is_known_to_be_gone(stage):
 
 
 def test_registration_finds_the_turn(stage):
-    centre = transform(TRUE, CRATE.world_from_box[:3, 3]).numpy() + [0.04, -0.03, 0.03]
+    centre = transform(TRUE, CRATE.world_from_box[:3, 3]).numpy() + np.array([0.04, -0.03, 0.03])
     wanted = tuple((p.open * 1.0 - ~p.changed.mask).astype(np.float32) for p in stage.past)
     best = register(stage.old.cloud, stage.past, Target(centre.astype(np.float32), wanted), np.array([0, 0, 1.0]))
     degrees, distance = error(best[0].new_from_old)
     assert degrees < 1.0 and distance < 0.008
-    assert best[0].score < 0.4 and all(a.score <= b.score for a, b in zip(best, best[1:]))
+    assert best[0].score < 0.4 and all(a.score <= b.score for a, b in pairwise(best))
 
 
 def test_matched_points_give_the_pose_although_some_are_wrong():
@@ -123,9 +123,7 @@ def test_colour_slopes_with_respect_to_the_pose_are_those_of_finite_differences(
 def test_an_object_moved_by_the_identity_is_rendered_where_it_was(stage):
     view = stage.past[0].view
     still = torch.eye(4, dtype=torch.float64)
-    rgb, depth, opacity = object_alone(
-        BEFORE, stage.old.grid(), camera_rays(view.camera, view.frame.world_from_cam), still
-    )
+    rgb, _, opacity = object_alone(BEFORE, stage.old.grid(), camera_rays(view.camera, view.frame.world_from_cam), still)
     here = (opacity > 0.9).numpy().reshape(view.shape)
     inward = torch.from_numpy(np.nan_to_num(view.surface + 0.02 * view.directions, posinf=9))
     true = CRATE.inside(inward).numpy()
@@ -142,10 +140,3 @@ def test_a_moved_object_is_rendered_as_the_moved_world_shows_it(stage):
     sure = (opacity > 0.95).reshape(view.shape)
     apart = (rgb.reshape(*view.shape, 3) - truth.rgb).abs().amax(-1)[sure]
     assert len(apart) > 100 and float(apart.median()) < 0.05
-
-
-def test_an_outline_needs_a_view_that_shows_it(stage):
-    away = [replace(f, world_from_cam=camera_at(0, 20, radius=-2.0)) for f in stage.scene.capture.frames]
-    everywhere = np.ones(stage.old.lattice.shape, bool)
-    seeds = Seeds(stage.old.lattice, stage.old.voxels, everywhere, ~everywhere)
-    assert outline(BEFORE, away, seeds, [], recipe.ObjectConfig()) is None

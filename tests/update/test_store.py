@@ -16,7 +16,7 @@ from refield.update.light import Relighting
 from refield.update.store import load_updated, save_updated
 from tests.fields import small_field
 
-STORED = {"pretrained", "change", "helper", "region", "light", "shading", "sampler"}
+STORED = {"bare", "eyes", "pretrained", "change", "helper", "region", "light", "shading", "sampler"}
 
 
 def a_light(seed: int) -> Relighting:

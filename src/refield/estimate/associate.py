@@ -266,7 +266,7 @@ def best_fit(
 def trimmed(
     ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past], change: PoseChange
 ) -> tuple[Old, PoseChange]:
-    """The object without what the photos show not to be at its new place (the projection check, §10.2.4, on new photos).
+    """The object without what the photos show not to be at its new place (§10.2.4 on new photos).
 
     What no old view saw behind an object counts as solid; the new photos may look at its other side.
     """

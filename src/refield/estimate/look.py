@@ -19,7 +19,6 @@ from torch import Tensor
 
 from refield.field.radiance import Field
 from refield.field.render import visible_samples
-from refield.field.render import visible_samples
 from refield.field.volrend import Samples, composite, weights
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays

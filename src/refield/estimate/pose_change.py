@@ -206,7 +206,7 @@ class Refiner:
         return e, weight, torch.stack(columns, -1)
 
     def _flow(self, crop: _Crop, shown: _Shown, centre: Tensor) -> Tensor:
-        """How the composite changes with a twist about ``centre``, (n, 3, 6): its object layer slides over the image."""
+        """Change of the composite with a twist about ``centre``, (n, 3, 6): its object layer slides over the image."""
         h, w = crop.shape
         alpha, layer = shown.opacity.reshape(h, w).numpy(), shown.layer.reshape(h, w, 3).numpy()
         seen = shown.depth.reshape(h, w).numpy()

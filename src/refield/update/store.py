@@ -80,7 +80,7 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
 def _region_out(name: str, region: Region) -> dict[str, Tensor]:
     out: dict[str, Tensor] = {}
     for i, grid in enumerate(region.grids):
-        out |= {f"{name}.{i}.aabb": grid.aabb, f"{name}.{i}.values": grid.values}
+        out |= {f"{name}.{i}.aabb": grid.aabb.clone(), f"{name}.{i}.values": grid.values.clone()}
     return out
 
 
