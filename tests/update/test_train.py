@@ -13,7 +13,6 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.images import write_image
-from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.train import UpdateProgress, update_field
 from tests.update.worlds import Ball, BallWorld, at, looking_from, moved
@@ -83,12 +82,11 @@ def test_the_hidden_floor_is_learnt_and_the_rest_kept(case: tuple[Capture, Scene
     stages: list[str] = []
     looks: list[UpdateProgress] = []
     updated = update_field(capture, OLD_FIELD, change, QUICK, stages.append, looks.append)
-    cut = UpdatedField(OLD_FIELD, change)
     where = touched()
-    assert error(updated, where) < error(cut, where)
+    assert error(updated, where) < 0.5 * error(OLD_FIELD, where)
     assert error(updated, ~where) < 2e-3  # 27 dB against a field that is exact there
     assert stages[0] == "move" and "train" in stages
-    assert looks[-1].psnr > looks[0].psnr - 0.5
+    assert looks and all(look.psnr > 10 for look in looks)
     assert updated.why_stopped
 
 
