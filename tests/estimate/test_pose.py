@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from refield.estimate import recipe
+from refield.estimate.alone import object_alone
 from refield.estimate.matched import camera_from_object, matched_poses
 from refield.estimate.past import changed_share, gone_score, look_past
-from refield.estimate.pose_change import RefineConfig, object_alone, refine, refiner
+from refield.estimate.pose_change import RefineConfig, refine, refiner
 from refield.estimate.register import Target, register, super_fibonacci, turns_about
 from refield.field.render import render_camera
 from refield.scene.camera import Camera
@@ -123,8 +124,9 @@ def test_colour_slopes_with_respect_to_the_pose_are_those_of_finite_differences(
 def test_an_object_moved_by_the_identity_is_rendered_where_it_was(stage):
     view = stage.past[0].view
     still = torch.eye(4, dtype=torch.float64)
-    rgb, _, opacity = object_alone(BEFORE, stage.old.grid(), camera_rays(view.camera, view.frame.world_from_cam), still)
-    here = (opacity > 0.9).numpy().reshape(view.shape)
+    alone = object_alone(BEFORE, stage.old, camera_rays(view.camera, view.frame.world_from_cam), still)
+    rgb = alone.rgb
+    here = (alone.opacity > 0.9).numpy().reshape(view.shape)
     inward = torch.from_numpy(np.nan_to_num(view.surface + 0.02 * view.directions, posinf=9))
     true = CRATE.inside(inward).numpy()
     assert (here & true).sum() > 0.9 * true.sum()
@@ -136,7 +138,8 @@ def test_a_moved_object_is_rendered_as_the_moved_world_shows_it(stage):
     after = BoxWorld((CRATE.moved(TRUE),))
     view = stage.past[1].view
     truth = render_camera(after, view.camera, view.frame.world_from_cam)
-    rgb, _, opacity = object_alone(BEFORE, stage.old.grid(), camera_rays(view.camera, view.frame.world_from_cam), TRUE)
-    sure = (opacity > 0.95).reshape(view.shape)
+    alone = object_alone(BEFORE, stage.old, camera_rays(view.camera, view.frame.world_from_cam), TRUE)
+    rgb = alone.rgb
+    sure = (alone.opacity > 0.95).reshape(view.shape)
     apart = (rgb.reshape(*view.shape, 3) - truth.rgb).abs().amax(-1)[sure]
     assert len(apart) > 100 and float(apart.median()) < 0.05

@@ -14,6 +14,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from refield.estimate.alone import object_alone
 from refield.estimate.detect import Changed, DetectConfig, Mask
 from refield.estimate.hull import Hull, HullConfig, Plane, votes
 from refield.estimate.lattice import Lattice, Voxels, components, grown
@@ -22,7 +23,7 @@ from refield.estimate.look import Array, View
 from refield.estimate.matched import matched_poses
 from refield.estimate.objects import ObjectConfig, Old, restricted
 from refield.estimate.past import Past, changed_share, gone_score, look_past
-from refield.estimate.pose_change import PoseChange, RefineConfig, object_alone, refine, refiner
+from refield.estimate.pose_change import PoseChange, RefineConfig, refine, refiner
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
 from refield.field.radiance import Field
 from refield.scene.pose import invert, transform
@@ -294,11 +295,12 @@ def take_off(field: Field, past: Sequence[Past], old: Old, change: PoseChange) -
     out = []
     for p in past:
         view = p.view
-        _, depth, opacity = object_alone(field, old.grid(), view.rays, change.new_from_old)
-        shown = ((opacity > 0.5).numpy() & (depth.numpy() <= p.depth.ravel() + 0.5 * old.radius)).reshape(view.shape)
+        alone = object_alone(field, old, view.rays, change.new_from_old)
+        depth = alone.depth.numpy()
+        shown = ((alone.opacity > 0.5).numpy() & (depth <= p.depth.ravel() + 0.5 * old.radius)).reshape(view.shape)
         shown = pixels.dilate(shown, 2)
         mask = p.changed.mask & ~shown
-        front = np.where(shown, np.minimum(p.depth, depth.numpy().reshape(view.shape)), p.depth)
+        front = np.where(shown, np.minimum(p.depth, depth.reshape(view.shape)), p.depth)
         changed = replace(p.changed, mask=mask)
         out.append(replace(p, changed=changed, depth=front.astype(np.float32), covered=p.covered | shown))
     return out

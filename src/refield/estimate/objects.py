@@ -8,16 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refield.estimate.hull import Plane
 from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.look import Array, Hidden, see
 from refield.field.radiance import Field
+from refield.field.warp import Outlook
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
@@ -105,6 +109,25 @@ class Old:
         """rms distance of its voxels from the centre, scaled to a ball's radius."""
         p = self.lattice.centres[self.voxels]
         return float(np.sqrt(((p - p.mean(0)) ** 2).sum(-1).mean() * 5 / 3))
+
+    @cached_property
+    def outlook(self) -> Outlook:
+        """The directions along which old photos looked at it."""
+        eyes = torch.from_numpy(np.stack([p.centre for p in self.patches]))
+        return Outlook.from_eyes(eyes, torch.from_numpy(self.centre))
+
+    @cached_property
+    def _sides(self) -> tuple[cKDTree, NDArray[np.int64], float]:
+        """The cloud, the side of each of its points, and how near to one of them a surface point must be."""
+        tree = cKDTree(self.cloud.points)
+        apart = float(np.median(tree.query(self.cloud.points, 2)[0][:, 1]))
+        return tree, sides_of(self.cloud.normals), 2 * apart + self.margin * self.lattice.cell
+
+    def side_of(self, points: Array) -> NDArray[np.int64]:
+        """Which of its six sides surface points (N, 3) are on, at its old place; -1 where no old photo saw it."""
+        tree, sides, reach = self._sides
+        distance, nearest = tree.query(points, distance_upper_bound=reach)
+        return np.where(np.isfinite(distance), np.append(sides, -1)[nearest], -1)
 
     @property
     def volume(self) -> float:
@@ -300,3 +323,20 @@ def restricted(old: Old, voxels: Voxels, config: ObjectConfig) -> Old:
     """The same object with other voxels."""
     cloud = surface_cloud(old.lattice, voxels, old.patches, config.points)
     return replace(old, voxels=voxels, cloud=cloud)
+
+
+def sides_of(normals: Array) -> NDArray[np.int64]:
+    """Which of six sides each normal (N, 3) belongs to, (N,): axes as the object's own normals have them."""
+    centred = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
+    axes = np.linalg.svd(centred, full_matrices=False)[2] if len(normals) >= 3 else np.eye(3)
+    for _ in range(10):  # turn the axes onto the faces of whatever is boxy
+        along = centred @ axes.T
+        best = np.abs(along).argmax(-1)
+        signs = np.sign(along[np.arange(len(best)), best])
+        pull = np.zeros((3, 3))
+        np.add.at(pull, best, centred * signs[:, None])
+        u, _, vt = np.linalg.svd(pull + 1e-6 * axes)
+        axes = u @ vt
+    along = centred @ axes.T
+    best = np.abs(along).argmax(-1)
+    return (2 * best + (along[np.arange(len(best)), best] > 0)).astype(np.int64)

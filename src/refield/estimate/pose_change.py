@@ -13,18 +13,19 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from refield.estimate.look import Array, load_photo, see, shaded
+from refield.estimate.alone import object_alone
+from refield.estimate.explain import Compared, explained
+from refield.estimate.look import load_photo, see
 from refield.estimate.objects import Old, box_in, patch_rays
 from refield.estimate.past import Past
 from refield.field.radiance import Field
-from refield.field.volrend import Samples
 from refield.scene.camera import Camera
 from refield.scene.capture import Rays
-from refield.scene.change import OccupancyGrid
-from refield.scene.pose import exp, invert, rotate, skew, transform
+from refield.scene.pose import exp, invert, skew, transform
 from refield.vision import pixels
 
 
@@ -160,10 +161,6 @@ class Refiner:
     pixel: float
     """world size of a pixel at the object"""
 
-    @cached_property
-    def grid(self) -> OccupancyGrid:
-        return self.old.grid()
-
     @property
     def apparent(self) -> float:
         """The object's radius in pixels."""
@@ -175,11 +172,30 @@ class Refiner:
 
     def show(self, crop: _Crop, new_from_old: Tensor) -> _Shown:
         """The moved object over the fixed background (Eqs. 1, 3)."""
-        seen, depth, opacity = object_alone(self.field, self.grid, crop.rays, new_from_old)
+        alone = object_alone(self.field, self.old, crop.rays, new_from_old)
+        seen, depth, opacity = alone.rgb, alone.depth, alone.opacity
         front = ((crop.depth - depth) > -self.pixel * 2) & (opacity > 0.02)
         o = torch.where(front, opacity, torch.zeros_like(opacity))[:, None]
         rgb = torch.where(front[:, None], seen, torch.zeros_like(seen))
         return _Shown(rgb + (1 - o) * crop.behind, rgb, o[:, 0], depth)
+
+    def sides(self, crop: _Crop, shown: _Shown, new_from_old: Tensor) -> NDArray[np.int64]:
+        """The side of the object at each pixel (n,); -1 where it is not, or no old photo saw what is there."""
+        out = np.full(len(shown.depth), -1)
+        solid = (shown.opacity > 0.8) & torch.isfinite(shown.depth)
+        x = crop.rays.origins[solid] + crop.rays.directions[solid] * shown.depth[solid, None]
+        out[solid.numpy()] = self.old.side_of(transform(invert(new_from_old), x).numpy())
+        return out
+
+    def compared(self, crop: _Crop, new_from_old: Tensor) -> Compared:
+        """What `explained` asks for."""
+        shown = self.show(crop, new_from_old)
+        photo, composite, unchanged = (
+            t.reshape(*crop.shape, 3).numpy() for t in (crop.photo, shown.rgb, crop.unchanged)
+        )
+        threshold = crop.threshold.reshape(crop.shape).numpy()
+        sides = self.sides(crop, shown, new_from_old).reshape(crop.shape)
+        return Compared(photo, composite, unchanged, threshold, sides)
 
     def residuals(self, new_from_old: Tensor, sigma: float, slopes: bool = True) -> Linear:
         """Blurred colour differences over all crops, and their derivatives by the six numbers of a twist."""
@@ -195,6 +211,8 @@ class Refiner:
         alpha = shown.opacity.reshape(crop.shape).numpy()
         inner = pixels.erode(alpha > 0.9, 1 + int(sigma > 1))
         weight = torch.from_numpy(np.where(inner, 1.0, self.config.outline).reshape(-1))
+        bare = (self.sides(crop, shown, pose) < 0) & (alpha.reshape(-1) > 0.8)
+        weight[torch.from_numpy(bare)] = 0.0  # a face that nobody saw: its colours are accidents
         even = _Even(
             torch.from_numpy(inner.astype(np.float32)), self.config.shading * self.apparent, self.config.shaded
         )
@@ -229,45 +247,6 @@ class Refiner:
         shift = torch.eye(4, dtype=torch.float64)
         shift[:3, 3] = c
         return shift @ step @ invert(shift) @ new_from_old
-
-
-def object_alone(field: Field, grid: OccupancyGrid, rays: Rays, new_from_old: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour (premultiplied), median depth and opacity of a moved object's own samples along rays.
-
-    The samples are where the field's own sampler has them: a field is only right at the spacing it was trained with.
-    """
-    old_from_new = invert(new_from_old)
-    there = Rays(transform(old_from_new, rays.origins), rotate(old_from_new, rays.directions))
-    n = len(rays)
-    rgb, depth, opacity = torch.zeros(n, 3), torch.full((n,), torch.inf), torch.zeros(n)
-    near, far = crossing(grid, there)
-    hit = (far > near).nonzero()[:, 0]
-    if len(hit) == 0:
-        return rgb, depth, opacity
-    there = there[hit]
-    samples = field.sampler(there)
-    ids = samples.ray_ids
-    middle = (samples.t_starts + samples.t_ends) / 2
-    keep = ((middle > near[hit][ids]) & (middle < far[hit][ids])).nonzero()[:, 0]
-    x = there.origins[ids[keep]] + there.directions[ids[keep]] * middle[keep, None]
-    inside = grid.contains(x)
-    keep, x = keep[inside], x[inside]
-    counts = torch.bincount(ids[keep], minlength=len(hit))
-    offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-    own = Samples(samples.t_starts[keep], samples.t_ends[keep], offsets)
-    with torch.no_grad():
-        seen = shaded(field, (x, there.directions[ids[keep]]), field.density(x), own)
-    rgb[hit], depth[hit], opacity[hit] = seen.rgb, seen.depth, seen.opacity
-    return rgb, depth, opacity
-
-
-def crossing(grid: OccupancyGrid, rays: Rays) -> tuple[Tensor, Tensor]:
-    """Distances (N,) at which rays enter and leave a grid's tight box; a ray misses if it does not enter first."""
-    lo, hi = grid.tight_aabb()
-    d = rays.directions
-    inverse = 1 / torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
-    a, b = (lo - rays.origins) * inverse, (hi - rays.origins) * inverse
-    return torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)
 
 
 def refiner(
@@ -388,28 +367,5 @@ def _described(r: Refiner, pose: Tensor, hessian: Tensor, unit: Tensor) -> PoseC
     covariance = unit[:, None] * covariance * unit[None]
     free = int((held < c.unseen).sum())
     note = f"the photos do not show its turn about {'any axis' if free == 3 else f'{free} of 3 axes'}" if free else ""
-    explained, before, count = _explained(r, pose)
-    return PoseChange(pose, covariance, noise, explained, before, count, r.pixel, note)
-
-
-def _explained(r: Refiner, pose: Tensor) -> tuple[float, float, int]:
-    """Part of the object's pixels that show what the composite does, and what the old field does."""
-    with_it, without, count = 0, 0, 0
-    for crop in r.crops:
-        shown = r.show(crop, pose)
-        here = (shown.opacity > 0.8).reshape(crop.shape).numpy()
-        photo, limit = crop.photo.reshape(*crop.shape, 3).numpy(), crop.threshold.reshape(crop.shape).numpy() * 1.5
-        relit = _relit(shown.rgb.reshape(*crop.shape, 3).numpy(), photo, here, r.config.shading * r.apparent)
-        new = pixels.colour_difference(photo, relit, 1)
-        old = pixels.colour_difference(photo, crop.unchanged.reshape(*crop.shape, 3).numpy(), 1)
-        with_it += int((here & (new < limit)).sum())
-        without += int((here & (old < limit)).sum())
-        count += int(here.sum())
-    return with_it / max(count, 1), without / max(count, 1), count
-
-
-def _relit(rgb: Array, photo: Array, here: Array, sigma: float) -> Array:
-    """``rgb`` with the object's smooth brightness taken from the photo, within a factor of two: it may have turned."""
-    weight = here.astype(np.float32)
-    light = pixels.blur(photo.mean(-1) * weight, sigma) / np.maximum(pixels.blur(rgb.mean(-1) * weight, sigma), 1e-4)
-    return rgb * np.where(here, np.clip(light, 0.5, 2.0), 1.0)[..., None].astype(np.float32)
+    part, before, count = explained([r.compared(crop, pose) for crop in r.crops], c.shading * r.apparent)
+    return PoseChange(pose, covariance, noise, part, before, count, r.pixel, note)

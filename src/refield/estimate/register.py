@@ -16,7 +16,7 @@ from torch import Tensor
 
 from refield.estimate.align_kernels import register_all
 from refield.estimate.look import Array, View
-from refield.estimate.objects import Cloud
+from refield.estimate.objects import Cloud, sides_of
 from refield.estimate.past import Past
 from refield.scene.pose import angle_between, rigid
 from refield.vision import pixels
@@ -202,23 +202,6 @@ class _Search:
             self.radius,
             block,
         )
-
-
-def sides_of(normals: Array) -> NDArray[np.int64]:
-    """Which of six sides each normal (N, 3) belongs to, (N,): axes as the object's own normals have them."""
-    centred = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
-    axes = np.linalg.svd(centred, full_matrices=False)[2] if len(normals) >= 3 else np.eye(3)
-    for _ in range(10):  # turn the axes onto the faces of whatever is boxy
-        along = centred @ axes.T
-        best = np.abs(along).argmax(-1)
-        signs = np.sign(along[np.arange(len(best)), best])
-        pull = np.zeros((3, 3))
-        np.add.at(pull, best, centred * signs[:, None])
-        u, _, vt = np.linalg.svd(pull + 1e-6 * axes)
-        axes = u @ vt
-    along = centred @ axes.T
-    best = np.abs(along).argmax(-1)
-    return (2 * best + (along[np.arange(len(best)), best] > 0)).astype(np.int64)
 
 
 def _pose(rotation: _F64, centre: _F64, middle: Array) -> Tensor:
