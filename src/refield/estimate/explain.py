@@ -1,0 +1,69 @@
+"""Whether photos show a moved object: pixel by pixel, in the light of its new place, where old photos saw it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from refield.estimate.look import Array
+from refield.vision import pixels
+
+_LIMIT = 1.5  # times the difference from which on a pixel counts as changed
+_LIGHT = 2.5  # times brighter or darker a side may be where the object is now
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One photo's pixels around an object, and what the composite and the old field show there."""
+
+    photo: Array
+    """(H, W, 3)"""
+    composite: Array
+    """(H, W, 3)"""
+    unchanged: Array
+    """(H, W, 3) the old field's rendering as it was"""
+    threshold: Array
+    """(H, W) Lab difference from which on a pixel counts as changed"""
+    sides: NDArray[np.int64]
+    """(H, W) the side of the object that the composite shows; -1 for none, or one that no old photo saw"""
+
+
+class Explained(NamedTuple):
+    """How much of an object's pixels ..."""
+
+    part: float
+    """show what the composite does"""
+    before: float
+    """show what the old field does"""
+    pixels: int
+    """how many there are, over all photos"""
+
+
+def explained(photos: Sequence[Compared], sigma: float) -> Explained:
+    """Ask every pixel that shows a known side; ``sigma``: pixels over which light on a side is even."""
+    with_it, without, count = 0, 0, 0
+    for p in photos:
+        here = p.sides >= 0
+        limit = _LIMIT * p.threshold
+        new = pixels.colour_difference(p.photo, _relit(p, sigma), 1)
+        old = pixels.colour_difference(p.photo, p.unchanged, 1)
+        with_it += int((here & (new < limit)).sum())
+        without += int((here & (old < limit)).sum())
+        count += int(here.sum())
+    return Explained(with_it / max(count, 1), without / max(count, 1), count)
+
+
+def _relit(p: Compared, sigma: float) -> Array:
+    """The composite with each side's smooth brightness taken from the photo: what turned is lit anew."""
+    gain = np.ones((*p.sides.shape, 1), np.float32)
+    seen, shown = p.photo.mean(-1), p.composite.mean(-1)
+    for side in range(int(p.sides.max(initial=-1)) + 1):
+        here = p.sides == side
+        weight = here.astype(np.float32)
+        light = pixels.blur(seen * weight, sigma) / np.maximum(pixels.blur(shown * weight, sigma), 1e-4)
+        gain[here] = np.clip(light[here], 1 / _LIGHT, _LIGHT)[:, None]
+    return p.composite * gain
