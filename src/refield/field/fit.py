@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from refield.field import kernels
+from refield.field.coverage import knowable
 from refield.field.encoding import Contraction
 from refield.field.losses import colour_loss, distortion_loss, scale_gradients
 from refield.field.occupancy import OccupancyTrainer
@@ -161,7 +162,8 @@ class _Fit:
         self.pixels = PixelBank(capture.train)
         self.judge = HeldOut(capture.held_out)
         self.adam = TableAdam(model, config.rate)
-        self.occupancy = OccupancyTrainer(model)
+        self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, capture.train))
+        model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
         self.samples_per_ray = config.samples / 512
         self.began = time.perf_counter()

@@ -25,9 +25,11 @@ class OccupancyTrainer:
     taken for empty can come back.
     """
 
-    def __init__(self, model: HashField, cull_from: int = 128) -> None:
+    def __init__(self, model: HashField, cull_from: int = 128, allowed: Tensor | None = None) -> None:
+        """``allowed`` (R**3,) bool: cells that may hold something at all; all by default."""
         self.model, self.cull_from = model, cull_from
         cells = model.sampler.resolution**3
+        self.allowed = torch.ones(cells, dtype=torch.bool) if allowed is None else allowed
         self.opacity = torch.zeros(cells)
         self.weight = torch.full((cells,), 16 * _WEIGHT)  # the benefit of the doubt
         self.recent_weight = torch.full((cells,), -1.0)  # since the last update; -1: no sample fell here
@@ -74,6 +76,7 @@ class OccupancyTrainer:
         return -torch.expm1(-torch.cat(parts) * self.lengths[cells])
 
     def _set(self, keep: Tensor) -> None:
+        keep = keep & self.allowed
         self.model.looking_where(keep.to(torch.uint8).reshape(self.model.sampler.grid.shape))
 
     def settle(self, pixels: PixelBank, rays: int = 200_000) -> None:

@@ -1,0 +1,40 @@
+"""Which cells the cameras can know: right before a few of them anything can be made to look like their photos."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from refield.field.sampling import OccupancySampler
+from refield.scene.capture import Frame
+
+_NEAR = 0.8  # core radii
+_PART, _LEAST, _ENOUGH = 0.1, 3, 6  # of the cameras; between these numbers of them
+_COARSE = 2  # cells of the occupancy grid, along each axis, that are decided together
+
+
+def knowable(sampler: OccupancySampler, frames: tuple[Frame, ...]) -> Tensor:
+    """(R**3,) bool: cells that may hold something.
+
+    A cell near a camera may if enough cameras see it; otherwise it would be painted with whatever these few photos
+    show behind it, a floater before any new camera. Where no camera sees, nothing is decided.
+    """
+    r = sampler.resolution // _COARSE
+    coarse = OccupancySampler(sampler.contraction, torch.zeros(r, r, r, dtype=torch.uint8), sampler.step)
+    x = coarse.points_in(torch.arange(r**3), jitter=False)
+    unit = _NEAR * sampler.contraction.radius
+    seen, near = torch.zeros(len(x), dtype=torch.int32), torch.zeros(len(x), dtype=torch.int32)
+    for f in frames:
+        m = f.world_from_cam.float()
+        local = (x - m[:3, 3]) @ m[:3, :3]
+        z = local[:, 2].clamp_min(1e-6)
+        c = f.camera
+        # the lens' distortion moves the frustum's sides by a little; the edge of a photo decides nothing
+        u, v = local[:, 0] / z * c.fx + c.cx, local[:, 1] / z * c.fy + c.cy
+        inside = (local[:, 2] > 0) & (u > 0) & (v > 0) & (u < c.width) & (v < c.height)
+        seen += inside
+        near += inside & (local.square().sum(-1) < unit**2)
+    enough = min(max(_LEAST, round(_PART * len(frames))), _ENOUGH, len(frames))
+    allowed = ((near == 0) | (seen >= enough)).reshape(1, 1, r, r, r).float()
+    return functional.interpolate(allowed, scale_factor=_COARSE, mode="nearest").reshape(-1) > 0
