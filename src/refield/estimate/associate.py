@@ -119,6 +119,18 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
     return Settled(moved, removed, tuple(arrived), tuple(views), tuple(olds))
 
 
+def unexplained(ground: Ground, settled: Settled, part: Voxels) -> bool:
+    """Whether most of the changed pixels that some voxels project to are not accounted for by what was settled."""
+    lattice = ground.hull.lattice
+    shown, left = 0, 0
+    for p in settled.views:
+        here = shadow_of(p.view, lattice, part)
+        came = np.logical_or.reduce([shadow_of(p.view, lattice, a) for a in settled.arrived] or [np.zeros_like(here)])
+        shown += int(here.sum())
+        left += int((here & p.changed.mask & ~p.explained & ~pixels.dilate(came, 2)).sum())
+    return left > ground.believe.touched * shown
+
+
 def _place_all(
     ground: Ground, olds: dict[int, Old], views: list[Past]
 ) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:

@@ -62,6 +62,8 @@ class Hull:
     """no old view looks through it"""
     unchanged: Voxels
     """some new view shows it as it was"""
+    behind: Array
+    """how far behind the old surface it is, in the view that comes nearest to it; world units"""
 
 
 def tolerance(view: View, distance: Array, config: HullConfig) -> Array:
@@ -85,14 +87,16 @@ def votes(points: Array, seen: Sequence[tuple[View, Mask]], config: HullConfig) 
     return inside_count, against
 
 
-def seen_through(points: Array, views: Sequence[View], config: HullConfig) -> NDArray[np.int16]:
-    """How many old renderings look through each point (N, 3), by their nearest depth among the pixels around."""
-    count = np.zeros(len(points), np.int16)
+def look_behind(points: Array, views: Sequence[View], config: HullConfig) -> tuple[NDArray[np.bool_], Array]:
+    """Whether some old rendering looks through each point (N, 3), and how far behind the old surface it is, in the
+    view that comes nearest to it; inf where none looks."""
+    through, behind = np.zeros(len(points), bool), np.full(len(points), np.inf, np.float32)
     for view in views:
         uv, distance, inside = view.project(points)
         front = view.lookup(view.depth, uv, inside)
-        count += inside & (distance < front - tolerance(view, distance, config))
-    return count
+        through |= inside & (distance < front - tolerance(view, distance, config))
+        behind = np.minimum(behind, np.where(inside & np.isfinite(front), distance - front, np.inf))
+    return through, behind
 
 
 def find_region(changed: Sequence[Changed], config: HullConfig) -> Lattice | None:
@@ -160,9 +164,9 @@ def carve(lattice: Lattice, seen: Sequence[tuple[View, Mask]], old: Sequence[Vie
     points = lattice.centres.reshape(-1, 3)
     inside, against = votes(points, [(v, pixels.dilate(m, config.margin)) for v, m in seen], config)
     hull = (inside >= min(2, len(seen))) & (against == 0)
-    solid = seen_through(points, old, config) == 0
-    shape = lattice.shape
-    return Hull(lattice, hull.reshape(shape), solid.reshape(shape), (against > 0).reshape(shape))
+    through, behind = look_behind(points, old, config)
+    found = (hull, ~through, against > 0, behind)
+    return Hull(lattice, *(a.reshape(lattice.shape) for a in found))
 
 
 def support_planes(points: Array, cameras: Array, tol: float, seed: int = 0) -> list[Plane]:

@@ -195,21 +195,26 @@ def look_around(field: Field, frames: Sequence[Frame], corners: Array, rays: int
     return out
 
 
-def carve_solid(lattice: Lattice, patches: Sequence[Patch], through: float) -> Voxels:
-    """Voxels that at most the part ``through`` of the old views look through (§10.2.4's projection check)."""
+def carve_solid(lattice: Lattice, patches: Sequence[Patch], through: float, deepest: float) -> Voxels:
+    """Voxels that at most the part ``through`` of the old views look through (§10.2.4's projection check), and that are
+    at most ``deepest`` (world units) behind the surface in some view."""
     points = torch.from_numpy(lattice.centres.reshape(-1, 3))
     left = torch.arange(len(points))
     passed = torch.zeros(len(points), dtype=torch.int16)
+    behind = torch.full((len(points),), torch.inf)
     order = np.random.default_rng(0).permutation(len(patches))
     for k in order:  # views that differ most come soon, so that air is dropped early
-        passed[left] += _looks_through(patches[k], points[left], 0.75 * lattice.cell).to(torch.int16)
+        depth = _behind_surface(patches[k], points[left])
+        passed[left] += (depth < -0.75 * lattice.cell).to(torch.int16)
+        behind[left] = torch.minimum(behind[left], depth)
         left = left[passed[left] <= through * len(patches)]
     solid = np.zeros(len(points), bool)
-    solid[left.numpy()] = True
+    solid[left[behind[left] < deepest].numpy()] = True
     return solid.reshape(lattice.shape)
 
 
-def _looks_through(p: Patch, points: Tensor, slack: float) -> Tensor:
+def _behind_surface(p: Patch, points: Tensor) -> Tensor:
+    """How far behind what the patch sees each point (N, 3) lies, (N,); inf outside the patch."""
     m = p.frame.world_from_cam
     local = (points - m[:3, 3].float()) @ m[:3, :3].float()
     uv, z = p.camera.project(local)
@@ -218,7 +223,7 @@ def _looks_through(p: Patch, points: Tensor, slack: float) -> Tensor:
     inside = (z > 0) & (i >= 0) & (i < h) & (j >= 0) & (j < w)
     at = torch.where(inside, i * w + j, torch.zeros_like(i))
     front = torch.from_numpy(p.depth).reshape(-1)[at]
-    return inside & (local.norm(dim=-1) < front - slack)
+    return torch.where(inside, local.norm(dim=-1) - front, torch.inf)
 
 
 def surface_cloud(lattice: Lattice, voxels: Voxels, patches: Sequence[Patch], count: int) -> Cloud:
@@ -289,7 +294,7 @@ def outline(
     if not patches:
         return None
     lattice = Lattice.over(low, high, config.longest)
-    solid = carve_solid(lattice, patches, config.through)
+    solid = carve_solid(lattice, patches, config.through, float((places.max(0) - places.min(0)).max()))
     free = np.ones(lattice.shape, bool)
     for plane in planes:
         free &= plane.height(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
@@ -305,18 +310,26 @@ def _connected(lattice: Lattice, solid: Voxels, seeds: Seeds, config: ObjectConf
     """The solid parts that the seeds belong to; less and less of them if they reach far beyond what changed.
 
     An object that stands free is taken whole, also where its change was not noticed. One that runs into others (or into
-    what no old view sees) loses first what certainly did not change, then all that is not in the change hull.
+    what no old view sees) loses first what certainly did not change, then all that is not in the change hull, then all
+    that is not a seed.
     """
     start = seeds.lattice.holds(grown(seeds.changed, 1), lattice.centres)
     kept = ~seeds.lattice.holds(seeds.unchanged, lattice.centres)
     hull = seeds.lattice.holds(grown(seeds.hull, 1), lattice.centres)
-    for allowed in (solid, solid & kept, solid & hull):
+    for allowed in (solid, solid & kept, solid & hull, start & solid):
         here = start & allowed
         parts = [p for p in components(allowed, 30) if (p & here).sum() > min(0.3 * here.sum(), 0.4 * p.sum())]
         voxels = np.logical_or.reduce(parts) if parts else np.zeros_like(solid)
-        if (voxels & here).sum() > config.changed * voxels.sum():
+        if (voxels & here).sum() > config.changed * voxels.sum() and not _at_border(voxels):
             break
     return voxels
+
+
+def _at_border(voxels: Voxels) -> bool:
+    """Whether voxels reach the border of their lattice, which is well beyond what is known of the object."""
+    inner = np.zeros_like(voxels)
+    inner[1:-1, 1:-1, 1:-1] = True
+    return bool((voxels & ~inner).any())
 
 
 def restricted(old: Old, voxels: Voxels, config: ObjectConfig) -> Old:

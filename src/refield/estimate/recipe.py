@@ -13,8 +13,9 @@ from torch import Tensor
 from refield.estimate import associate, detect, hull, light, look, objects, past, segment
 from refield.estimate.associate import AssociateConfig, Ground, Settled
 from refield.estimate.detect import Changed, DetectConfig
+from refield.estimate.faces import changed_parts
 from refield.estimate.hull import Hull, HullConfig, Plane
-from refield.estimate.lattice import Lattice, Voxels, components
+from refield.estimate.lattice import Lattice, Voxels
 from refield.estimate.look import Array, View
 from refield.estimate.objects import ObjectConfig, Old, Seeds
 from refield.estimate.pose_change import PoseChange, RefineConfig
@@ -24,8 +25,10 @@ from refield.scene.capture import Capture, Frame
 from refield.scene.change import ObjectChange, PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
 from refield.vision import pixels
+from refield.vision.segmenter import GrabCutSegmenter, Segmenter
 
 OnStage = Callable[[str], None]
+_GRABCUT = GrabCutSegmenter()
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,7 @@ class _Scene:
     changed: tuple[Changed, ...]
     planes: list[Plane]
     """what holds things up"""
+    segmenter: Segmenter
 
 
 def estimate_change(
@@ -71,12 +75,14 @@ def estimate_change(
     frames: Sequence[Frame],
     config: EstimateConfig = EstimateConfig(),
     on_stage: OnStage | None = None,
+    segmenter: Segmenter = _GRABCUT,
 ) -> SceneChange:
     """What moved, left or arrived between the capture that ``field`` was fitted to and a few new photos (§4.2).
 
     Args:
         frames: the new photos, with poses in the capture's world.
         on_stage: called with each step's name as it begins.
+        segmenter: tells things from what is behind them in the old field's pictures.
 
     Raises:
         InputError: most of the pixels changed: the photos show another scene.
@@ -84,7 +90,7 @@ def estimate_change(
     say = on_stage or (lambda name: None)
     photos = tuple(PlacedPhoto(f.name, "used", frame=f) for f in frames)
     say("detect")
-    scene = _detected(capture, field, frames, config)
+    scene = _detected(capture, field, frames, config, segmenter)
     if not any(c.mask.any() for c in scene.changed):
         return SceneChange((), photos, "no pixel differs by more than the field's own errors on the old photos")
     say("hull")
@@ -92,7 +98,8 @@ def estimate_change(
     if region is None:
         return SceneChange((), photos, "the pixels that differ agree on no place that more than one photo shows")
     carved, free = _carved(scene, region)
-    olds = _were_there(scene, carved, free)
+    things, others = changed_parts(scene.changed, carved, free, config.hull.smallest, segmenter)
+    olds = _were_there(scene, carved, things or others)
     say("pose")
     up = scene.planes[0].normal if scene.planes else _up(capture)
     ground = Ground(
@@ -100,11 +107,17 @@ def estimate_change(
         config.associate, config.register, config.refine,
     )  # fmt: skip
     settled = associate.settle(ground, olds, scene.changed)
+    # what goes on outside of the changed pixels was hidden by something, as a rule; else it is a thing after all
+    overlooked = [p for p in others if things and associate.unexplained(ground, settled, p)]
+    if overlooked:
+        settled = associate.settle(ground, [*olds, *_were_there(scene, carved, overlooked)], scene.changed)
     say("segment")
     return _concluded(scene, photos, settled.olds, settled, carved)
 
 
-def _detected(capture: Capture, field: Field, frames: Sequence[Frame], config: EstimateConfig) -> _Scene:
+def _detected(
+    capture: Capture, field: Field, frames: Sequence[Frame], config: EstimateConfig, segmenter: Segmenter
+) -> _Scene:
     views = [look.view_of(field, f, config.max_pixels) for f in frames]
     survey = [look.view_of(field, f, config.max_pixels) for f in look.spread_out(capture.frames, config.survey)]
     noise = detect.survey_noise(survey, config.detect)
@@ -115,7 +128,7 @@ def _detected(capture: Capture, field: Field, frames: Sequence[Frame], config: E
         raise InputError("new photos", what, "give photos of the scene that was trained, with poses in its world")
     planes = _planes([n.view for n in noise], changed)
     changed = light.set_light_aside(changed, planes, config.detect)
-    return _Scene(capture, field, config, tuple(n.view for n in noise), tuple(changed), planes)
+    return _Scene(capture, field, config, tuple(n.view for n in noise), tuple(changed), planes, segmenter)
 
 
 def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
@@ -131,7 +144,13 @@ def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
     points = points[np.random.default_rng(0).permutation(len(points))[:6000]]
     sizes = [float(np.median(c.view.depth[c.mask])) * c.view.pixel_angle for c in changed if c.mask.any()]
     cameras = np.stack([v.centre for v in survey])
-    return hull.support_planes(points, cameras, 0.7 * float(np.median(sizes))) if len(points) >= 50 else []
+    if len(points) < 50:
+        return []
+    for rough in (1, 2, 4):  # times what pixels resolve: a fitted surface may be uneven
+        planes = hull.support_planes(points, cameras, rough * 0.7 * float(np.median(sizes)))
+        if planes:
+            return planes
+    return []
 
 
 def _carved(scene: _Scene, region: Lattice) -> tuple[Hull, Voxels]:
@@ -145,11 +164,11 @@ def _carved(scene: _Scene, region: Lattice) -> tuple[Hull, Voxels]:
     return carved, free
 
 
-def _were_there(scene: _Scene, carved: Hull, free: Voxels) -> list[Old]:
-    """Whole objects of the old field that have a part in the change hull."""
+def _were_there(scene: _Scene, carved: Hull, parts: Sequence[Voxels]) -> list[Old]:
+    """Whole objects of the old field that parts of the change hull belong to."""
     found: list[Old] = []
     config = scene.config
-    for part in components(carved.hull & carved.solid & free, config.hull.smallest)[: config.associate.most]:
+    for part in parts[: config.associate.most]:
         if any(old.lattice.holds(old.voxels, carved.lattice.centres[part]).mean() > 0.5 for old in found):
             continue
         seeds = Seeds(carved.lattice, part, carved.hull, carved.unchanged)

@@ -24,7 +24,7 @@ class Segmenter(Protocol):
     def masks(
         self, image: NDArray[np.uint8], boxes: Boxes, hint: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Boxes (B, 4) px xyxy -> (B, H, W) bool and (B,) score in [0, 1]; ``hint`` (B, H, W): likely inside."""
+        """Boxes (B, 4) px xyxy -> (B, H, W) bool and (B,) score in [0, 1]; nothing outside ``hint`` (B, H, W) is in."""
         ...
 
 
@@ -34,6 +34,8 @@ class GrabCutSegmenter:
 
     rounds: int = 4
     """of colour model and cut"""
+    around: float = 0.12
+    """of the image's longer side; what is this near to the box shows the background's colours"""
     stride: int = 4
     """pixels a feature cell is wide"""
 
@@ -61,19 +63,19 @@ class GrabCutSegmenter:
         h, w = image.shape[:2]
         x0, y0 = np.clip(np.floor(box[:2]).astype(int), 0, [w, h])
         x1, y1 = np.clip(np.ceil(box[2:]).astype(int), 0, [w, h])
-        labels = np.full((h, w), cv2.GC_BGD, np.uint8)
-        labels[y0:y1, x0:x1] = cv2.GC_PR_FGD if hint is None else cv2.GC_PR_BGD
-        if hint is not None:
-            labels[hint & (labels == cv2.GC_PR_BGD)] = cv2.GC_PR_FGD
-            labels[pixels.erode(hint, 3) & (labels == cv2.GC_PR_FGD)] = cv2.GC_FGD
-        inside = (labels == cv2.GC_PR_FGD) | (labels == cv2.GC_FGD)
-        if inside.sum() < 8 or inside.all():
-            return inside
+        maybe = np.zeros((h, w), bool)
+        maybe[y0:y1, x0:x1] = True if hint is None else hint[y0:y1, x0:x1]
+        reach = round(self.around * max(h, w))
+        x0, y0, x1, y1 = max(x0 - reach, 0), max(y0 - reach, 0), min(x1 + reach, w), min(y1 + reach, h)
+        labels = np.where(maybe[y0:y1, x0:x1], cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
+        if maybe.sum() < 8 or (labels == cv2.GC_PR_FGD).all():
+            return maybe
         background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
-        bgr = np.ascontiguousarray(image[..., ::-1])
+        bgr = np.ascontiguousarray(image[y0:y1, x0:x1, ::-1])
         cv2.setRNGSeed(0)
         cv2.grabCut(bgr, labels, (0, 0, 1, 1), background, foreground, self.rounds, cv2.GC_INIT_WITH_MASK)
-        return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+        maybe[y0:y1, x0:x1] &= labels == cv2.GC_PR_FGD
+        return maybe
 
 
 def _outline_score(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> float:

@@ -1,0 +1,107 @@
+"""The old surfaces under the changed pixels, one per thing: cut by colour and where the depth jumps, joined over views.
+
+Behind what arrived lies something that only seems changed; where it and what left are side by side, the hull is one
+piece of both, and so is everything solid behind them as far as anyone can see. But in the old field's pictures what
+left is all inside the changed pixels, while what is behind the newcomer goes on outside of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from refield.estimate.detect import Changed, Mask
+from refield.estimate.hull import Hull
+from refield.estimate.lattice import Lattice, Voxels, components, grown
+from refield.estimate.look import Array, View
+from refield.vision import pixels
+from refield.vision.segmenter import Segmenter
+
+_JUMP = 5.0  # pixels' widths; a surface that is fitted well bends by less from one pixel to the next
+_SHARED = 0.3  # of the smaller of two faces' voxels, for them to be one
+
+
+def changed_parts(
+    changed: Sequence[Changed], carved: Hull, free: Voxels, smallest: int, segmenter: Segmenter
+) -> tuple[list[Voxels], list[Voxels]]:
+    """Solid parts of the change hull, the largest first: those that look like things, and the others.
+
+    Each has one surface and reaches no deeper behind it than that is wide. ``free``: voxels in front of what holds
+    things up.
+    """
+    lattice = carved.lattice
+    solid = carved.hull & carved.solid & free
+    marked = [_things_in(c, segmenter) for c in changed]
+    own = _joined([f for c, t in zip(changed, marked) for f in _faces_in(c.view, c.mask & t, lattice, solid)])
+    behind = _joined([f for c, t in zip(changed, marked) for f in _faces_in(c.view, c.mask & ~t, lattice, solid)])
+    faces = own + behind
+    if not faces:
+        return [], []
+    label = np.zeros(lattice.shape, np.int32)
+    for k, face in enumerate(faces, start=1):
+        label[face & (label == 0)] = k
+    nearest = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
+    label = label[tuple(nearest)]
+    things: list[Voxels] = []
+    others: list[Voxels] = []
+    for k, face in enumerate(faces, start=1):
+        at = lattice.centres[face]
+        width = float((at.max(0) - at.min(0)).max()) + lattice.cell
+        mine = solid & (label == k) & (carved.behind < width)
+        parts = [p for p in components(mine, smallest) if (p & face).any()]
+        (things if k <= len(own) else others).extend(parts)
+    return sorted(things, key=_voxels_less), sorted(others, key=_voxels_less)
+
+
+def _voxels_less(part: Voxels) -> int:
+    return -int(part.sum())
+
+
+def _things_in(c: Changed, segmenter: Segmenter) -> Mask:
+    """Changed pixels at which the old field shows something that is nowhere outside of them."""
+    label, count = ndimage.label(c.mask)
+    if count == 0:
+        return c.mask
+    hints = np.stack([label == k for k in range(1, count + 1)])
+    boxes = np.array([pixels.bounding_box(h) for h in hints], np.float64)
+    image = (np.clip(c.view.rgb, 0, 1) * 255).astype(np.uint8)
+    return np.logical_or.reduce(segmenter.masks(image, boxes, hints)[0])
+
+
+def _faces_in(view: View, mask: Mask, lattice: Lattice, allowed: Voxels) -> list[Voxels]:
+    """The voxels at each smooth piece of the old surface under a mask."""
+    label, count = ndimage.label(mask & ~_jumps(view))
+    out = []
+    for k in range(1, count + 1):
+        points = view.surface[label == k]
+        ijk, inside = lattice.index(points[np.isfinite(points).all(-1)])
+        face = np.zeros(lattice.shape, bool)
+        face[tuple(ijk[inside].T)] = True
+        out.append(grown(face, 1) & allowed)
+    return [f for f in out if f.any()]
+
+
+def _jumps(view: View) -> Mask:
+    """Pixels at which the depth bends by more than a surface does."""
+    far = float(np.nanmax(np.where(np.isfinite(view.depth), view.depth, np.nan), initial=1.0))
+    depth = np.where(np.isfinite(view.depth), view.depth, 2 * far)
+    bend: Array = np.zeros(view.shape, np.float32)
+    bend[1:-1] = np.abs(depth[:-2] - 2 * depth[1:-1] + depth[2:])
+    bend[:, 1:-1] = np.maximum(bend[:, 1:-1], np.abs(depth[:, :-2] - 2 * depth[:, 1:-1] + depth[:, 2:]))
+    return bend > _JUMP * view.pixel_angle * depth
+
+
+def _joined(faces: Sequence[Voxels]) -> list[Voxels]:
+    """Faces that share voxels put together."""
+    if not faces:
+        return []
+    flat = np.stack([f.ravel() for f in faces])
+    sizes = flat.sum(1)
+    shared = flat.astype(np.float32) @ flat.astype(np.float32).T
+    same = shared > _SHARED * np.minimum(sizes[:, None], sizes[None])
+    _, group = connected_components(coo_matrix(same), directed=False)
+    return [flat[group == g].any(0).reshape(faces[0].shape) for g in range(group.max() + 1)]
