@@ -21,7 +21,8 @@ from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.light import even_and_grey, log_ratio
 from refield.estimate.look import Array, View
 from refield.estimate.matched import matched_poses
-from refield.estimate.objects import ObjectConfig, Old, restricted
+from refield.estimate.objects import Old
+from refield.estimate.outline import ObjectConfig, restricted
 from refield.estimate.past import Past, changed_share, gone_score, look_past
 from refield.estimate.pose_change import PoseChange, RefineConfig, refine, refiner
 from refield.estimate.register import Candidate, RegisterConfig, Target, register

@@ -1,13 +1,9 @@
-"""An object as it was: its solid shape, carved by every old view, and its coloured surface.
-
-The paper asks a segmenter for the object in every old photo and keeps the grid points that fall inside (§10.2.4); here
-the field itself says what each old view sees, so that the projection check needs no segmenter.
-"""
+"""An object as it was: its voxels, its coloured surface, and the parts of the old views that show it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,32 +13,13 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refield.estimate.hull import Plane
-from refield.estimate.lattice import Lattice, Voxels, components, grown
+from refield.estimate.lattice import Lattice, Voxels, grown
 from refield.estimate.look import Array, Hidden, see
 from refield.field.radiance import Field
 from refield.field.warp import Outlook
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
-
-
-@dataclass(frozen=True)
-class ObjectConfig:
-    """How an object's shape is found."""
-
-    longest: int = 64
-    """voxels along the longest side of the box around the object"""
-    box: float = 1.6
-    """size of that box relative to the changed part"""
-    rays: int = 60_000
-    """looked along, over all old views together"""
-    through: float = 0.05
-    """a voxel is empty if more than this part of the old views that look at it look through it"""
-    changed: float = 0.5
-    """part of an object's voxels that must be seeds for it to be taken whole"""
-    points: int = 1500
-    """on the coloured surface"""
 
 
 @dataclass(frozen=True)
@@ -73,6 +50,22 @@ class Patch:
         d = self.rays.directions.numpy().reshape(*self.depth.shape, 3)
         with np.errstate(invalid="ignore"):
             return (self.centre + d * self.depth[..., None]).astype(np.float32)
+
+    def pixel_of(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """World points (N, 3) -> index into the patch's pixels, row by row, (N,), and whether they fall in it."""
+        m = self.frame.world_from_cam
+        uv, z = self.camera.project((points - m[:3, 3].float()) @ m[:3, :3].float())
+        j, i = uv[:, 0].floor().long() - self.box[0], uv[:, 1].floor().long() - self.box[1]
+        h, w = self.depth.shape
+        inside = (z > 0) & (i >= 0) & (i < h) & (j >= 0) & (j < w)
+        return torch.where(inside, i * w + j, torch.zeros_like(i)), inside
+
+    def behind_surface(self, points: Tensor) -> Tensor:
+        """How far behind what the patch shows each world point (N, 3) lies, (N,); inf outside the patch."""
+        where, inside = self.pixel_of(points)
+        front = torch.from_numpy(self.depth).reshape(-1)[where]
+        distance = (points - torch.from_numpy(self.centre)).norm(dim=-1)
+        return torch.where(inside, distance - front, torch.inf)
 
 
 @dataclass(frozen=True)
@@ -195,37 +188,6 @@ def look_around(field: Field, frames: Sequence[Frame], corners: Array, rays: int
     return out
 
 
-def carve_solid(lattice: Lattice, patches: Sequence[Patch], through: float, deepest: float) -> Voxels:
-    """Voxels that at most the part ``through`` of the old views look through (§10.2.4's projection check), and that are
-    at most ``deepest`` (world units) behind the surface in some view."""
-    points = torch.from_numpy(lattice.centres.reshape(-1, 3))
-    left = torch.arange(len(points))
-    passed = torch.zeros(len(points), dtype=torch.int16)
-    behind = torch.full((len(points),), torch.inf)
-    order = np.random.default_rng(0).permutation(len(patches))
-    for k in order:  # views that differ most come soon, so that air is dropped early
-        depth = _behind_surface(patches[k], points[left])
-        passed[left] += (depth < -0.75 * lattice.cell).to(torch.int16)
-        behind[left] = torch.minimum(behind[left], depth)
-        left = left[passed[left] <= through * len(patches)]
-    solid = np.zeros(len(points), bool)
-    solid[left[behind[left] < deepest].numpy()] = True
-    return solid.reshape(lattice.shape)
-
-
-def _behind_surface(p: Patch, points: Tensor) -> Tensor:
-    """How far behind what the patch sees each point (N, 3) lies, (N,); inf outside the patch."""
-    m = p.frame.world_from_cam
-    local = (points - m[:3, 3].float()) @ m[:3, :3].float()
-    uv, z = p.camera.project(local)
-    j, i = uv[:, 0].floor().long() - p.box[0], uv[:, 1].floor().long() - p.box[1]
-    h, w = p.depth.shape
-    inside = (z > 0) & (i >= 0) & (i < h) & (j >= 0) & (j < w)
-    at = torch.where(inside, i * w + j, torch.zeros_like(i))
-    front = torch.from_numpy(p.depth).reshape(-1)[at]
-    return torch.where(inside, local.norm(dim=-1) - front, torch.inf)
-
-
 def surface_cloud(lattice: Lattice, voxels: Voxels, patches: Sequence[Patch], count: int) -> Cloud:
     """What the patches see of the voxels' surface, thinned evenly to about ``count`` points."""
     near = grown(voxels, 1)
@@ -263,79 +225,6 @@ def _thinned(points: Array, colours: Array, facing: Array, count: int) -> Cloud:
         if len(keep) <= count:
             break
     return Cloud(*(np.ascontiguousarray(a[keep], np.float32) for a in (xyz, points[:, 3:], colours)))
-
-
-@dataclass(frozen=True)
-class Seeds:
-    """What is known of an object before its shape is."""
-
-    lattice: Lattice
-    changed: Voxels
-    """in the change hull and solid in the old field: certainly part of it"""
-    hull: Voxels
-    """in the change hull: it may be part of it"""
-    unchanged: Voxels
-    """some new view shows it as it was: hardly part of it"""
-
-
-def outline(
-    field: Field, frames: Sequence[Frame], seeds: Seeds, planes: Sequence[Plane], config: ObjectConfig
-) -> Old | None:
-    """The whole object that the changed voxels belong to, or None if no old view shows one.
-
-    Args:
-        planes: what the object may stand on or lean against; not part of it.
-    """
-    places = seeds.lattice.centres[seeds.changed]
-    middle, half = (places.min(0) + places.max(0)) / 2, (places.max(0) - places.min(0)) / 2
-    half = np.maximum(half * config.box, half + 3 * seeds.lattice.cell)
-    low, high = middle - half, middle + half
-    patches = look_around(field, frames, corners_of(low, high), config.rays)
-    if not patches:
-        return None
-    lattice = Lattice.over(low, high, config.longest)
-    solid = carve_solid(lattice, patches, config.through, float((places.max(0) - places.min(0)).max()))
-    free = np.ones(lattice.shape, bool)
-    for plane in planes:
-        free &= plane.height(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
-    voxels = _connected(lattice, solid & free, seeds, config)
-    if not voxels.any():
-        return None
-    voxels = ndimage.binary_fill_holes(voxels)
-    cloud = surface_cloud(lattice, voxels, patches, config.points)
-    return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= 30 else None
-
-
-def _connected(lattice: Lattice, solid: Voxels, seeds: Seeds, config: ObjectConfig) -> Voxels:
-    """The solid parts that the seeds belong to; less and less of them if they reach far beyond what changed.
-
-    An object that stands free is taken whole, also where its change was not noticed. One that runs into others (or into
-    what no old view sees) loses first what certainly did not change, then all that is not in the change hull, then all
-    that is not a seed.
-    """
-    start = seeds.lattice.holds(grown(seeds.changed, 1), lattice.centres)
-    kept = ~seeds.lattice.holds(seeds.unchanged, lattice.centres)
-    hull = seeds.lattice.holds(grown(seeds.hull, 1), lattice.centres)
-    for allowed in (solid, solid & kept, solid & hull, start & solid):
-        here = start & allowed
-        parts = [p for p in components(allowed, 30) if (p & here).sum() > min(0.3 * here.sum(), 0.4 * p.sum())]
-        voxels = np.logical_or.reduce(parts) if parts else np.zeros_like(solid)
-        if (voxels & here).sum() > config.changed * voxels.sum() and not _at_border(voxels):
-            break
-    return voxels
-
-
-def _at_border(voxels: Voxels) -> bool:
-    """Whether voxels reach the border of their lattice, which is well beyond what is known of the object."""
-    inner = np.zeros_like(voxels)
-    inner[1:-1, 1:-1, 1:-1] = True
-    return bool((voxels & ~inner).any())
-
-
-def restricted(old: Old, voxels: Voxels, config: ObjectConfig) -> Old:
-    """The same object with other voxels."""
-    cloud = surface_cloud(old.lattice, voxels, old.patches, config.points)
-    return replace(old, voxels=voxels, cloud=cloud)
 
 
 def sides_of(normals: Array) -> NDArray[np.int64]:

@@ -10,14 +10,15 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from refield.estimate import associate, detect, hull, light, look, objects, past, segment
+from refield.estimate import associate, detect, hull, light, look, past, segment
 from refield.estimate.associate import AssociateConfig, Ground, Settled
 from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.faces import changed_parts
 from refield.estimate.hull import Hull, HullConfig, Plane
 from refield.estimate.lattice import Lattice, Voxels
 from refield.estimate.look import Array, View
-from refield.estimate.objects import ObjectConfig, Old, Seeds
+from refield.estimate.objects import Old
+from refield.estimate.outline import ObjectConfig, Seeds, outline
 from refield.estimate.pose_change import PoseChange, RefineConfig
 from refield.estimate.register import RegisterConfig
 from refield.field.radiance import Field
@@ -172,7 +173,7 @@ def _were_there(scene: _Scene, carved: Hull, parts: Sequence[Voxels]) -> list[Ol
         if any(old.lattice.holds(old.voxels, carved.lattice.centres[part]).mean() > 0.5 for old in found):
             continue
         seeds = Seeds(carved.lattice, part, carved.hull, carved.unchanged)
-        old = objects.outline(scene.field, scene.capture.train, seeds, scene.planes, config.objects)
+        old = outline(scene.field, scene.capture.train, seeds, scene.planes, scene.segmenter, config.objects)
         if old is not None:
             found.append(old)
     return found

@@ -1,0 +1,168 @@
+"""An object's solid shape as it was, carved by every old view (§10.2.4).
+
+The paper asks a segmenter for the object in every old photo and keeps the grid points that fall inside. The field says
+what each old view sees, so an object that stands free needs no segmenter; one that runs into others does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from refield.estimate.hull import Plane
+from refield.estimate.lattice import Lattice, Voxels, components, grown
+from refield.estimate.objects import Old, Patch, corners_of, look_around, surface_cloud
+from refield.field.radiance import Field
+from refield.scene.capture import Frame
+from refield.vision import pixels
+from refield.vision.segmenter import Segmenter
+
+
+@dataclass(frozen=True)
+class ObjectConfig:
+    """How an object's shape is found."""
+
+    longest: int = 64
+    """voxels along the longest side of the box around the object"""
+    box: float = 1.6
+    """size of that box relative to the changed part"""
+    rays: int = 60_000
+    """looked along, over all old views together"""
+    through: float = 0.05
+    """a voxel is empty if more than this part of the old views that look at it look through it"""
+    outside: float = 0.3
+    """a voxel of an object that runs into others is not its own if more than this part of the old views say so"""
+    changed: float = 0.5
+    """part of an object's voxels that must be seeds for it to be taken whole"""
+    points: int = 1500
+    """on the coloured surface"""
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """What is known of an object before its shape is."""
+
+    lattice: Lattice
+    changed: Voxels
+    """in the change hull and solid in the old field: certainly part of it"""
+    hull: Voxels
+    """in the change hull: it may be part of it"""
+    unchanged: Voxels
+    """some new view shows it as it was: hardly part of it"""
+
+
+def outline(
+    field: Field,
+    frames: Sequence[Frame],
+    seeds: Seeds,
+    planes: Sequence[Plane],
+    segmenter: Segmenter,
+    config: ObjectConfig,
+) -> Old | None:
+    """The whole object that the changed voxels belong to, or None if no old view shows one.
+
+    Args:
+        planes: what the object may stand on or lean against; not part of it.
+    """
+    places = seeds.lattice.centres[seeds.changed]
+    middle, half = (places.min(0) + places.max(0)) / 2, (places.max(0) - places.min(0)) / 2
+    half = np.maximum(half * config.box, half + 3 * seeds.lattice.cell)
+    low, high = middle - half, middle + half
+    patches = look_around(field, frames, corners_of(low, high), config.rays)
+    if not patches:
+        return None
+    lattice = Lattice.over(low, high, config.longest)
+    solid = carve_solid(lattice, patches, config.through, float((places.max(0) - places.min(0)).max()))
+    free = np.ones(lattice.shape, bool)
+    for plane in planes:
+        free &= plane.height(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
+    voxels, stands_free = _connected(lattice, solid & free, seeds, config)
+    if not stands_free:
+        voxels = _cut_out(lattice, voxels, patches, segmenter, config)
+    if not voxels.any():
+        return None
+    voxels = ndimage.binary_fill_holes(voxels)
+    cloud = surface_cloud(lattice, voxels, patches, config.points)
+    return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= 30 else None
+
+
+def _connected(lattice: Lattice, solid: Voxels, seeds: Seeds, config: ObjectConfig) -> tuple[Voxels, bool]:
+    """The solid parts that the seeds belong to; less and less of them if they reach far beyond what changed.
+
+    And whether they are all that is solid there.
+
+    An object that stands free is taken whole, also where its change was not noticed. One that runs into others (or into
+    what no old view sees) loses first what certainly did not change, then all that is not in the change hull, then all
+    that is not a seed.
+    """
+    start = seeds.lattice.holds(grown(seeds.changed, 1), lattice.centres)
+    kept = ~seeds.lattice.holds(seeds.unchanged, lattice.centres)
+    hull = seeds.lattice.holds(grown(seeds.hull, 1), lattice.centres)
+    for allowed in (solid, solid & kept, solid & hull, start & solid):
+        here = start & allowed
+        parts = [p for p in components(allowed, 30) if (p & here).sum() > min(0.3 * here.sum(), 0.4 * p.sum())]
+        voxels = np.logical_or.reduce(parts) if parts else np.zeros_like(solid)
+        if (voxels & here).sum() > config.changed * voxels.sum() and not _at_border(voxels):
+            break
+    return voxels, allowed is solid
+
+
+def _cut_out(
+    lattice: Lattice, voxels: Voxels, patches: Sequence[Patch], segmenter: Segmenter, config: ObjectConfig
+) -> Voxels:
+    """Voxels without those that too many old views show outside of the object, by a segmenter (§10.2.4)."""
+    points = lattice.centres[voxels]
+    thick = float((points.max(0) - points.min(0)).max())
+    asked, outside = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    near = grown(voxels, 1)
+    for p in patches:
+        hint = pixels.close(lattice.holds(near, p.points), 3)
+        box = pixels.bounding_box(hint)
+        if box is None or hint.sum() < 12:
+            continue
+        image = (np.clip(p.rgb, 0, 1) * 255).astype(np.uint8)
+        mask = segmenter.masks(image, np.array([box], np.float64), hint[None])[0][0]
+        where, inside = p.pixel_of(torch.from_numpy(points))
+        behind = p.behind_surface(torch.from_numpy(points)).numpy()
+        seen = inside.numpy() & (behind < thick)
+        asked += seen
+        outside += seen & ~mask.ravel()[where.numpy()]
+    kept = voxels.copy()
+    kept[voxels] = outside <= config.outside * asked
+    parts = components(kept, 30)
+    return parts[0] if parts else np.zeros_like(voxels)
+
+
+def _at_border(voxels: Voxels) -> bool:
+    """Whether voxels reach the border of their lattice, which is well beyond what is known of the object."""
+    inner = np.zeros_like(voxels)
+    inner[1:-1, 1:-1, 1:-1] = True
+    return bool((voxels & ~inner).any())
+
+
+def restricted(old: Old, voxels: Voxels, config: ObjectConfig) -> Old:
+    """The same object with other voxels."""
+    cloud = surface_cloud(old.lattice, voxels, old.patches, config.points)
+    return replace(old, voxels=voxels, cloud=cloud)
+
+
+def carve_solid(lattice: Lattice, patches: Sequence[Patch], through: float, deepest: float) -> Voxels:
+    """Voxels that at most the part ``through`` of the old views look through (§10.2.4's projection check), and that are
+    at most ``deepest`` (world units) behind the surface in some view."""
+    points = torch.from_numpy(lattice.centres.reshape(-1, 3))
+    left = torch.arange(len(points))
+    passed = torch.zeros(len(points), dtype=torch.int16)
+    behind = torch.full((len(points),), torch.inf)
+    order = np.random.default_rng(0).permutation(len(patches))
+    for k in order:  # views that differ most come soon, so that air is dropped early
+        depth = patches[k].behind_surface(points[left])
+        passed[left] += (depth < -0.75 * lattice.cell).to(torch.int16)
+        behind[left] = torch.minimum(behind[left], depth)
+        left = left[passed[left] <= through * len(patches)]
+    solid = np.zeros(len(points), bool)
+    solid[left[behind[left] < deepest].numpy()] = True
+    return solid.reshape(lattice.shape)
