@@ -41,7 +41,7 @@ def object_alone(field: Field, old: Old, rays: Rays, new_from_old: Tensor) -> Se
     offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
     own = Samples(samples.t_starts[keep], samples.t_ends[keep], offsets)
     with torch.no_grad():
-        along = old.outlook.held(there.directions)[ids[keep]]
+        along = old.outlook.held(x, there.directions[ids[keep]])
         seen = shaded(field, (x, along), field.density(x), own)
     rgb[hit], depth[hit], opacity[hit] = seen.rgb, seen.depth, seen.opacity
     return Seen(rgb, depth, opacity)

@@ -107,7 +107,7 @@ class Old:
     def outlook(self) -> Outlook:
         """The directions along which old photos looked at it."""
         eyes = torch.from_numpy(np.stack([p.centre for p in self.patches]))
-        return Outlook.from_eyes(eyes, torch.from_numpy(self.centre))
+        return Outlook.from_eyes(eyes, self.grid())
 
     @cached_property
     def _sides(self) -> tuple[cKDTree, NDArray[np.int64], float]:

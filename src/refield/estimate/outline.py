@@ -81,7 +81,7 @@ def outline(
     for plane in planes:
         free &= plane.height(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
     voxels, stands_free = _connected(lattice, solid & free, seeds, config)
-    if not stands_free:
+    if voxels.any() and not stands_free:
         voxels = _cut_out(lattice, voxels, patches, segmenter, config)
     if not voxels.any():
         return None

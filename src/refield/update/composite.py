@@ -16,7 +16,7 @@ from refield.field.radiance import Field, HashField
 from refield.field.render import visible_samples
 from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples
-from refield.field.warp import Move, Outlook, inside_box, looked_up, moves_of, outline, owners
+from refield.field.warp import Move, Outlook, inside_box, looked_up, moves_of, owners
 from refield.scene.capture import Rays
 from refield.scene.change import SceneChange
 from refield.update.light import Relighting
@@ -66,8 +66,7 @@ class UpdatedField:
         self.region = region
         self.moves: tuple[Move, ...] = moves_of(change)
         self._shells = tuple(Move(grown(m.grid, SKIN * pretrained.sampler.step), m.new_from_old) for m in self.moves)
-        centres = [outline(m.grid).mean(0) for m in self.moves]
-        self._outlooks = [] if eyes is None else [Outlook.from_eyes(eyes, c) for c in centres]
+        self._outlooks = [] if eyes is None else [Outlook.from_eyes(eyes, m.grid) for m in self.moves]
         self.sampler_step = pretrained.sampler.step
         self.boxes = tuple(m.box_now for m in self._shells) + region.boxes
         if sampler is None:
@@ -93,7 +92,7 @@ class UpdatedField:
 
     def _retold_samples(self, rays: Rays, jitter: bool) -> Samples:
         """All samples in cells that changed; only the rays that come near any are marched, and no further."""
-        exits = torch.stack([_exit(rays, box) for box in self._marched]).amax(0)
+        exits = torch.stack([leaving(rays, box) for box in self._marched]).amax(0)
         near = (exits > 0).nonzero()[:, 0]
         far = float(exits.max()) / self.sampler.contraction.radius if len(near) else 0.0
         marcher = replace(self.sampler, grid=self.sampler.grid * self._retold, far=min(far, self.sampler.far))
@@ -152,7 +151,7 @@ class UpdatedField:
         at, along = looked_up(x[near], d[near], mover, [m.old_from_new for m in self.moves])
         for i, outlook in enumerate(self._outlooks):
             mine = (mover == i).nonzero()[:, 0]
-            along = along.index_copy(0, mine, outlook.held(along[mine]))
+            along = along.index_copy(0, mine, outlook.held(at[mine], along[mine]))
         asked, turned = x.index_copy(0, near, at), d.index_copy(0, near, along)
         return asked, turned, owner, (~inside).nonzero()[:, 0], inside.nonzero()[:, 0]
 
@@ -202,7 +201,7 @@ def _by_cells(sampler: OccupancySampler, box: Tensor) -> Tensor:
     return torch.stack([box[0] - margin, box[1] + margin])
 
 
-def _exit(rays: Rays, box: Tensor) -> Tensor:
+def leaving(rays: Rays, box: Tensor) -> Tensor:
     """Distance at which each ray leaves a world box, (N,); 0 if it does not meet it."""
     inverse = 1 / torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)
     a, b = (box[0] - rays.origins) * inverse, (box[1] - rays.origins) * inverse

@@ -19,7 +19,7 @@ from refield.scene.capture import Capture, Frame, centres
 from refield.scene.change import SceneChange
 from refield.scene.pose import transform
 from refield.update.bare import bare_skin
-from refield.update.composite import UpdatedField
+from refield.update.composite import UpdatedField, leaving
 from refield.update.config import UpdateConfig
 from refield.update.fit_helper import HelperTraining, Lit, UpdateProgress
 from refield.update.frozen import composite_once
@@ -31,6 +31,7 @@ from refield.vision.pixels import dilate
 
 DEFAULTS = UpdateConfig()
 _PATCHES, _FOLDS, _SHADING_CELLS = 8, 4, 6  # an object's side in patches that are left out together; in cells
+_LIT_RAYS = 60_000  # of the new photos; a lattice of factors is no finer than they show
 _RING_RAYS = 40_000  # of the old photos; more add time and nothing to learn
 
 
@@ -106,14 +107,15 @@ def _in_reach(region: OccupancySampler, frames: tuple[Frame, ...]) -> OccupancyS
 
 def _light(sparse: Lessons, field: Field, change: SceneChange, changed: list[np.ndarray]) -> Relighting | None:
     """The light on what did not change, from the new photos' pixels that show it; each photo is a fold."""
-    still = torch.cat([torch.from_numpy(~dilate(c, math.ceil(0.01 * c.shape[1]))).reshape(-1) for c in changed])
-    seen = sparse[still.nonzero()[:, 0]]
-    was = render_many(field, seen.rays)
-    x = seen.rays.origins + seen.rays.directions * was.depth[:, None]
-    solid = (was.opacity > 0.9).nonzero()[:, 0]
     box = Region(tuple(g for o in change.objects for g in (o.grid, o.grid_now) if g is not None)).box
     side = max(float((o.grid.tight_aabb().diff(dim=0)).max()) for o in change.objects)
     box = torch.stack([box[0] - 1.5 * side, box[1] + 1.5 * side])
+    still = torch.cat([torch.from_numpy(~dilate(c, math.ceil(0.01 * c.shape[1]))).reshape(-1) for c in changed])
+    may = (still & (leaving(sparse.rays, box) > 0)).nonzero()[:, 0]
+    seen = sparse[may[torch.randperm(len(may))[:_LIT_RAYS].sort().values]]
+    was = render_many(field, seen.rays)
+    x = seen.rays.origins + seen.rays.directions * was.depth[:, None]
+    solid = (was.opacity > 0.9).nonzero()[:, 0]
     return fit_light(Sightings(x, seen.rgb, was.rgb, seen.photo)[solid], box, 1.5 * _pixel(change, box.mean(0)))
 
 
