@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-import torch
-from scipy import ndimage
-from torch import Tensor
 
-from refield.estimate import associate, detect, hull, light, look, past, segment
-from refield.estimate.associate import AssociateConfig, Ground, Settled
+from refield.estimate import associate, detect, hull, light, look
+from refield.estimate.associate import AssociateConfig, Ground
+from refield.estimate.conclude import concluded
 from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.faces import changed_parts
 from refield.estimate.hull import Hull, HullConfig, Plane
@@ -19,13 +17,12 @@ from refield.estimate.lattice import Lattice, Voxels
 from refield.estimate.look import Array, View
 from refield.estimate.objects import Old
 from refield.estimate.outline import ObjectConfig, Seeds, outline
-from refield.estimate.pose_change import PoseChange, RefineConfig
+from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
 from refield.field.radiance import Field
 from refield.scene.capture import Capture, Frame
-from refield.scene.change import ObjectChange, PlacedPhoto, SceneChange
+from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
-from refield.vision import pixels
 from refield.vision.segmenter import GrabCutSegmenter, Segmenter
 
 OnStage = Callable[[str], None]
@@ -113,7 +110,7 @@ def estimate_change(
     if overlooked:
         settled = associate.settle(ground, [*olds, *_were_there(scene, carved, overlooked)], scene.changed)
     say("segment")
-    return _concluded(scene, photos, settled.olds, settled, carved)
+    return concluded(capture.train, scene.changed, photos, settled, carved)
 
 
 def _detected(
@@ -183,51 +180,3 @@ def _up(capture: Capture) -> Array:
     """The direction most cameras hold upwards."""
     down = np.stack([f.world_from_cam[:3, 1].numpy() for f in capture.frames]).mean(0)
     return (-down / max(float(np.linalg.norm(down)), 1e-9)).astype(np.float32)
-
-
-def _concluded(
-    scene: _Scene, photos: tuple[PlacedPhoto, ...], olds: Sequence[Old], settled: Settled, carved: Hull
-) -> SceneChange:
-    frames = scene.capture.train
-    changes = [_moved(frames, olds[k], c) for k, c in settled.moved.items()]
-    for k, share in settled.removed.items():
-        changes.append(
-            ObjectChange("removed", olds[k].grid(), masks=segment.masks_out(frames, olds[k]), confidence=share)
-        )
-    for part in settled.arrived:
-        values = ndimage.gaussian_filter(ndimage.binary_fill_holes(part).astype(np.float32), 0.7)
-        grid = carved.lattice.grid(values)
-        changes.append(ObjectChange("added", grid, masks_in=segment.masks_in(frames, grid)))
-    if not changes:
-        why = "some pixels differ, but no object that moved, left or arrived explains them better than the old field"
-        return SceneChange((), photos, why)
-    counts = {k: sum(c.kind == k for c in changes) for k in ("moved", "removed", "added")}
-    why = ", ".join(f"{n} {k}" for k, n in counts.items() if n)
-    return SceneChange(tuple(changes), photos, why, *_pixel_masks(scene, olds, settled))
-
-
-def _moved(frames: Sequence[Frame], old: Old, change: PoseChange) -> ObjectChange:
-    out = ObjectChange("moved", old.grid(), change.new_from_old, segment.masks_out(frames, old))
-    now = out.grid_now
-    assert now is not None  # a moved object is somewhere
-    return replace(
-        out,
-        masks_in=segment.masks_in(frames, now),
-        confidence=change.explained,
-        covariance=change.covariance,
-        note=change.note,
-    )
-
-
-def _pixel_masks(scene: _Scene, olds: Sequence[Old], settled: Settled) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Per new photo at its full size: changed pixels that show what is there now, and where something used to be."""
-    ins, outs = [], []
-    for c in scene.changed:
-        gone = np.zeros(c.view.shape, bool)
-        for k in (*settled.moved, *settled.removed):
-            gone |= past.silhouette(c.view, olds[k])
-        size = np.array([c.view.frame.camera.height, c.view.frame.camera.width])
-        full = [ndimage.zoom(m.astype(np.uint8), size / c.view.shape, order=0) > 0 for m in (c.mask, gone)]
-        ins.append(torch.from_numpy(full[0]))
-        outs.append(torch.from_numpy(pixels.dilate(full[1], 1)))
-    return tuple(ins), tuple(outs)

@@ -110,7 +110,8 @@ class ObjectChange:
     """Per old training frame, (H, W) bool: where its new place projects. Empty for ``removed``."""
     confidence: float = 1.0
     covariance: Tensor | None = None
-    """(6, 6) float64 of the twist (world units, radians) that left-multiplies ``new_from_old``."""
+    """(6, 6) float64 of the twist (world units, radians; about the world's origin) that left-multiplies
+    ``new_from_old``."""
     note: str = ""
     """What the user should know: an unobservable turn, a weak match."""
 

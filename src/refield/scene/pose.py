@@ -35,14 +35,22 @@ def invert(a_from_b: Tensor) -> Tensor:
 
 
 def transform(a_from_b: Tensor, points_b: Tensor) -> Tensor:
-    """Move points (..., 3) from frame b to frame a, in the points' own dtype."""
+    """Move points (..., 3) from frame b to frame a, in the points' own dtype.
+
+    One pose (4, 4) moves any number of points; many poses (..., 4, 4) go with the points' leading dimensions.
+    """
     m = a_from_b.to(points_b.dtype)
-    return points_b @ m[..., :3, :3].transpose(-1, -2) + m[..., None, :3, 3].squeeze(-2)
+    if m.ndim == 2:
+        return points_b @ m[:3, :3].T + m[:3, 3]
+    return (m[..., :3, :3] @ points_b[..., None])[..., 0] + m[..., :3, 3]
 
 
 def rotate(a_from_b: Tensor, directions_b: Tensor) -> Tensor:
-    """Turn directions (..., 3) from frame b to frame a, in the directions' own dtype."""
-    return directions_b @ a_from_b[..., :3, :3].to(directions_b.dtype).transpose(-1, -2)
+    """Turn directions (..., 3) from frame b to frame a, as `transform` moves points."""
+    m = a_from_b.to(directions_b.dtype)
+    if m.ndim == 2:
+        return directions_b @ m[:3, :3].T
+    return (m[..., :3, :3] @ directions_b[..., None])[..., 0]
 
 
 def _coefficients(theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -107,6 +115,13 @@ def log(a_from_b: Tensor) -> Tensor:
     left_jacobian = eye + b * k + c * (k @ k)
     rho = torch.linalg.solve(left_jacobian, a_from_b[..., :3, 3:])[..., 0]
     return torch.cat([rho, phi], -1)
+
+
+def adjoint(a_from_b: Tensor) -> Tensor:
+    """(6, 6): a twist in frame b -> the same motion's twist in frame a, ``T exp(t) T^-1 == exp(adjoint(T) t)``."""
+    r = a_from_b[:3, :3]
+    top = torch.cat([r, skew(a_from_b[:3, 3]) @ r], 1)
+    return torch.cat([top, torch.cat([torch.zeros_like(r), r], 1)])
 
 
 def angle_between(r1: Tensor, r2: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ class UpdateConfig:
     """of the helper in a step"""
     sparse_share: float = 0.5
     """of each batch's rays drawn from the new photos"""
-    rate: float = 1e-2
+    rate: float = 2e-2
     """Adam's learning rate, held for the first half, then brought down to a thirtieth"""
     distortion: float = 1e-2
     """weight of the distortion loss"""
