@@ -30,7 +30,7 @@ from refield.update.supervision import Lessons, Places, changed_pixels, new_less
 from refield.vision.pixels import dilate
 
 DEFAULTS = UpdateConfig()
-_PATCHES, _FOLDS, _SHADING_CELLS = 8, 4, 6  # an object's side in patches that are left out together; in cells
+_PATCHES, _FOLDS, _SHADING_CELLS = 8, 4, 24  # an object's side in patches that are left out together; in cells
 _LIT_RAYS = 60_000  # of the new photos; a lattice of factors is no finer than they show
 _RING_RAYS = 40_000  # of the old photos; more add time and nothing to learn
 
