@@ -9,6 +9,7 @@ import torch
 
 from refield.estimate import recipe
 from refield.estimate.alone import object_alone
+from refield.estimate.faces import changed_parts
 from refield.estimate.matched import camera_from_object, matched_poses
 from refield.estimate.past import changed_share, gone_score, look_past
 from refield.estimate.pose_change import RefineConfig, refine, refiner
@@ -17,6 +18,7 @@ from refield.field.render import render_camera
 from refield.scene.camera import Camera
 from refield.scene.capture import camera_rays
 from refield.scene.pose import angle_between, invert, transform
+from refield.vision.segmenter import GrabCutSegmenter
 from tests.estimate.boxes import BoxWorld, camera_at, capture_of, new_photos, standing, turn
 
 CRATE = standing((0.2, 0.17, 0.18), -0.2, -0.15, 20, paint=3)
@@ -38,10 +40,10 @@ def stage(tmp_path_factory):
     capture = capture_of(BEFORE, folder / "before")
     frames = new_photos(BoxWorld((CRATE.moved(TRUE),)), folder / "after")
     config = recipe.EstimateConfig(survey=6)
-    scene = recipe._detected(capture, BEFORE, frames, config)
+    scene = recipe._detected(capture, BEFORE, frames, config, GrabCutSegmenter())
     region = recipe.hull.find_region(scene.changed, config.hull)
     carved, free = recipe._carved(scene, region)
-    (old,) = recipe._were_there(scene, carved, free)
+    (old,) = recipe._were_there(scene, carved, changed_parts(scene.changed, carved, free, 40, scene.segmenter)[0])
     past = look_past(BEFORE, scene.changed, scene.survey, [old], config.detect)
     return Stage(scene, old, past)
 

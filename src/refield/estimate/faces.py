@@ -75,13 +75,17 @@ def _things_in(c: Changed, segmenter: Segmenter) -> Mask:
 def _faces_in(view: View, mask: Mask, lattice: Lattice, allowed: Voxels) -> list[Voxels]:
     """The voxels at each smooth piece of the old surface under a mask."""
     label, count = ndimage.label(mask & ~_jumps(view))
+    if count == 0:
+        return []
+    footprint = view.pixel_angle * float(np.median(view.depth[label > 0]))
+    reach = max(1, int(np.ceil(0.75 * footprint / lattice.cell))) if np.isfinite(footprint) else 1
     out = []
     for k in range(1, count + 1):
         points = view.surface[label == k]
         ijk, inside = lattice.index(points[np.isfinite(points).all(-1)])
         face = np.zeros(lattice.shape, bool)
         face[tuple(ijk[inside].T)] = True
-        out.append(grown(face, 1) & allowed)
+        out.append(grown(face, reach) & allowed)
     return [f for f in out if f.any()]
 
 

@@ -13,7 +13,7 @@ from refield.estimate.conclude import concluded
 from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.faces import changed_parts
 from refield.estimate.hull import Hull, HullConfig, Plane
-from refield.estimate.lattice import Lattice, Voxels
+from refield.estimate.lattice import Lattice, Voxels, grown
 from refield.estimate.look import Array, View
 from refield.estimate.objects import Old
 from refield.estimate.outline import ObjectConfig, Seeds, outline
@@ -107,8 +107,9 @@ def estimate_change(
     settled = associate.settle(ground, olds, scene.changed)
     # what goes on outside of the changed pixels was hidden by something, as a rule; else it is a thing after all
     overlooked = [p for p in others if things and associate.unexplained(ground, settled, p)]
-    if overlooked:
-        settled = associate.settle(ground, [*olds, *_were_there(scene, carved, overlooked)], scene.changed)
+    more = _were_there(scene, carved, overlooked, olds)
+    if more:
+        settled = associate.settle(ground, [*olds, *more], scene.changed)
     say("segment")
     return concluded(capture.train, scene.changed, photos, settled, carved)
 
@@ -162,12 +163,13 @@ def _carved(scene: _Scene, region: Lattice) -> tuple[Hull, Voxels]:
     return carved, free
 
 
-def _were_there(scene: _Scene, carved: Hull, parts: Sequence[Voxels]) -> list[Old]:
-    """Whole objects of the old field that parts of the change hull belong to."""
+def _were_there(scene: _Scene, carved: Hull, parts: Sequence[Voxels], known: Sequence[Old] = ()) -> list[Old]:
+    """Whole objects of the old field that parts of the change hull belong to, but for those already known."""
     found: list[Old] = []
     config = scene.config
     for part in parts[: config.associate.most]:
-        if any(old.lattice.holds(old.voxels, carved.lattice.centres[part]).mean() > 0.5 for old in found):
+        at = carved.lattice.centres[part]
+        if any(old.lattice.holds(grown(old.voxels, old.margin), at).mean() > 0.5 for old in (*known, *found)):
             continue
         seeds = Seeds(carved.lattice, part, carved.hull, carved.unchanged)
         old = outline(scene.field, scene.capture.train, seeds, scene.planes, scene.segmenter, config.objects)
