@@ -20,7 +20,7 @@ class UpdateConfig:
     """Fit how the light on unchanged surfaces changed."""
     steps: int = 400
     """of gradient descent"""
-    max_seconds: float = 10.0
+    max_seconds: float = 20.0
     """for all of the steps; the learning rate follows whichever of steps and seconds is further on"""
     samples: int = 8192
     """of the helper in a step"""
