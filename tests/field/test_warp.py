@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from refield.field.warp import Move, move_in, outline, two_way
+from refield.field.warp import Move, Outlook, move_in, outline, two_way
 from refield.scene import pose
 from refield.scene.change import OccupancyGrid
 
@@ -117,3 +117,18 @@ def test_the_outline_holds_everything_the_grid_contains() -> None:
         box = outline(g)
         found = x[g.contains(x)]
         assert len(found) and (found >= box[0]).all() and (found <= box[1]).all()
+
+
+def test_each_side_is_asked_from_where_it_was_seen() -> None:
+    """Cameras around a ball's waist: its top is asked along one of their directions, a side along one that faces it."""
+    turns = torch.arange(12) * 2 * math.pi / 12
+    eyes = torch.stack([3 * turns.cos(), 3 * turns.sin(), torch.zeros(12)], -1)
+    outlook = Outlook.from_eyes(eyes, ball((0.0, 0.0, 0.0), 0.5))
+    assert math.isclose(outlook.reach, math.pi / 12, rel_tol=1e-3)
+    east = torch.tensor([[0.48, 0.0, 0.0]])
+    seen, unseen = torch.tensor([[-1.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]])
+    assert torch.equal(outlook.held(east, seen), seen)
+    held = outlook.held(east, unseen)  # from within: no camera saw the east side along this
+    assert float(held[0, 0]) < 0 and torch.allclose(held.norm(dim=-1), torch.ones(1))
+    from_below = torch.tensor([[0.0, 0.0, 1.0]])
+    assert abs(float(outlook.held(east, from_below)[0, 2])) <= math.sin(outlook.reach) + 1e-5

@@ -88,3 +88,21 @@ def test_nearest_rotation_is_a_rotation_and_near(twist, noise):
 def test_nearest_rotation_of_a_reflection_is_none():
     mirrored = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
     assert torch.isclose(torch.linalg.det(pose.nearest_rotation(mirrored)), torch.tensor(1.0, dtype=torch.float64))
+
+
+@relaxed
+@given(twists, twists)
+def test_adjoint_carries_a_twist_to_another_frame(a, t):
+    a, t = pose.exp(0.3 * a), 0.3 * t
+    same = a @ pose.exp(t) @ pose.invert(a)
+    assert torch.allclose(pose.exp(pose.adjoint(a) @ t), same, atol=1e-8)
+
+
+def test_many_poses_go_with_as_many_points():
+    g = torch.Generator().manual_seed(0)
+    poses = pose.exp(torch.randn(5, 6, generator=g, dtype=torch.float64))
+    points = torch.randn(5, 3, generator=g, dtype=torch.float64)
+    for move in (pose.transform, pose.rotate):
+        one_by_one = torch.stack([move(p, x) for p, x in zip(poses, points)])
+        assert torch.allclose(move(poses, points), one_by_one)
+        assert move(poses[:, None], points[None]).shape == (5, 5, 3)
