@@ -20,7 +20,7 @@ def camera_on_a_ring(turn: float) -> Frame:
     x = torch.stack([-t.sin(), t.cos(), t * 0])
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = x, torch.linalg.cross(z, x), z, -2 * z
-    return Frame(Path("a.png"), Camera(64, 64, 160, 160, 32, 32), "a", pose)
+    return Frame(Path("a.png"), Camera(64, 64, 240, 240, 32, 32), "a", pose)
 
 
 def allowed(frames: tuple[Frame, ...], *point: float) -> bool:
