@@ -125,6 +125,19 @@ def test_core_cube_lies_around_what_the_cameras_look_at(capture: Capture) -> Non
     assert 0.9 < space.radius < 1.8
 
 
+def test_a_rig_that_looks_one_way_is_placed_by_its_points(capture: Capture) -> None:
+    """Parallel axes meet nowhere; the reconstruction says how far the scene is."""
+    frames = []
+    for k in range(12):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:2, 3] = torch.tensor([0.1 * (k % 4), 0.1 * (k // 4)])
+        frames.append(replace(capture.frames[0], world_from_cam=pose))
+    g = torch.Generator().manual_seed(0)
+    points = torch.rand(200, 3, generator=g) * 0.4 + torch.tensor([0.0, 0.0, 1.8])
+    space = place_contraction(Capture(tuple(frames), points))
+    assert abs(float(space.centre[2]) - 2.0) < 0.3 and 0.8 < space.radius < 1.6
+
+
 def test_learning_rate_is_held_then_falls() -> None:
     assert rate_factor(0.0) == rate_factor(0.5) == 1
     assert 0.03 < rate_factor(1.0) < 0.04

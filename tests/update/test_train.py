@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -102,3 +104,13 @@ def test_no_change_gives_the_field_back(case: tuple[Capture, SceneChange]) -> No
     capture, _ = case
     updated = update_field(capture, OLD_FIELD, SceneChange(), QUICK)
     assert error(updated) == error(OLD_FIELD)
+
+
+def test_photos_that_look_away_only_move_things(case: tuple[Capture, SceneChange]) -> None:
+    """No ray meets the region and no pixel tells the light: nothing is taught, and nothing breaks."""
+    capture, change = case
+    away = change.frames[0].world_from_cam.clone()
+    away[:3, 0], away[:3, 2] = -away[:3, 0], -away[:3, 2]
+    photo = replace(change.photos[0], frame=replace(change.frames[0], world_from_cam=away))
+    updated = update_field(capture, OLD_FIELD, SceneChange(change.objects, (photo,)), replace(QUICK, steps=50))
+    assert len(updated.moves) == 1 and math.isfinite(error(updated))

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
 from refield.field.fit import FitConfig, fit_field
-from refield.scene.capture import Capture
+from refield.scene.capture import Capture, centres
 from refield.scene.errors import InputError
 from refield.scene.load import load_capture
 from refield.workspace import Workspace
@@ -46,6 +46,7 @@ def train(data: Path, work: Path, clock: Clock, config: FitConfig, *, overwrite:
     clock.stage("load the capture")
     capture = load_capture(data, warn=clock.warn)
     _check_memory(data, capture)
+    _check_cameras(data, capture)
     with Workspace.building(work, overwrite=overwrite, made_by=made_by) as workspace:
         capture = workspace.keep_capture(capture)
         clock.stage(f"fit a field to {len(capture.train)} photos")
@@ -55,6 +56,15 @@ def train(data: Path, work: Path, clock: Clock, config: FitConfig, *, overwrite:
         workspace.keep_field(fitted, line.psnr)
     clock.stop()
     return line.psnr
+
+
+def _check_cameras(data: Path, capture: Capture) -> None:
+    """Refuse photos that show nothing in depth."""
+    at = centres(capture.frames)
+    spread = float((at - at.mean(0)).norm(dim=-1).max())
+    if len(at) < 3 or spread < 1e-9 * (1 + float(at.abs().max())):
+        what = f"its {len(at)} photos were taken from {'one place' if len(at) >= 3 else 'too few places'}"
+        raise InputError(data, what, "give photos from many sides, 50 or more")
 
 
 def _check_memory(data: Path, capture: Capture) -> None:

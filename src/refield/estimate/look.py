@@ -47,7 +47,7 @@ class Seen:
 def see(field: Field, rays: Rays, hidden: Hidden | None = None) -> Seen:
     """Colour, median depth and opacity of rays through the field, without the samples that are ``hidden``."""
     with torch.no_grad():
-        parts = [_see(field, rays[i : i + _CHUNK], hidden) for i in range(0, len(rays), _CHUNK)]
+        parts = [_see(field, rays[i : i + _CHUNK], hidden) for i in range(0, max(len(rays), 1), _CHUNK)]
     return Seen(
         torch.cat([p.rgb for p in parts]), torch.cat([p.depth for p in parts]), torch.cat([p.opacity for p in parts])
     )

@@ -149,8 +149,9 @@ def box_in(camera: Camera, frame: Frame, corners: Array, margin: int = 1) -> tup
     """The rectangle of an image that world points (N, 3) project to; None if it misses the image."""
     m = frame.world_from_cam
     local = (torch.from_numpy(corners).double() - m[:3, 3]) @ m[:3, :3]
-    if (local[:, 2] <= 1e-3).any():
-        return None
+    ahead = local[:, 2] > 0
+    if not ahead.all():  # around the camera, or beside it: any pixel may show a part
+        return (0, 0, camera.width, camera.height) if ahead.any() else None
     uv = camera.project(local)[0].numpy()
     x0, y0 = np.floor(uv.min(0)).astype(int) - margin
     x1, y1 = np.ceil(uv.max(0)).astype(int) + margin

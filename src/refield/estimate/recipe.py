@@ -141,7 +141,8 @@ def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
     pad = 0.3 * float((high - low).max())
     points = points[((points > low - pad) & (points < high + pad)).all(-1)]
     points = points[np.random.default_rng(0).permutation(len(points))[:6000]]
-    sizes = [float(np.median(c.view.depth[c.mask])) * c.view.pixel_angle for c in changed if c.mask.any()]
+    depths = [(c.view, c.view.depth[c.mask & np.isfinite(c.view.depth)]) for c in changed]
+    sizes = [float(np.median(d)) * v.pixel_angle for v, d in depths if len(d)]
     cameras = np.stack([v.centre for v in survey])
     if len(points) < 50:
         return []

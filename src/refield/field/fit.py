@@ -101,19 +101,29 @@ def fit_field(
 def place_contraction(capture: Capture) -> Contraction:
     """Where the core cube goes: around what the cameras look at, reaching half-way to them.
 
-    The centre is the least-squares meeting point of the optical axes, held to the cameras' own spread where the axes
-    hardly meet (a forward-facing capture).
+    The centre is the least-squares meeting point of the optical axes, held to what the cameras have before them where
+    the axes hardly meet (a forward-facing capture): the points of the reconstruction, or else their own spread.
     """
     centres = torch.stack([f.centre for f in capture.frames])
     axes = torch.stack([f.world_from_cam[:3, 2] for f in capture.frames])
     eye = torch.eye(3, dtype=torch.float64)
     across = eye - axes[:, :, None] * axes[:, None, :]
     spread = (centres - centres.mean(0)).norm(dim=-1).mean().clamp_min(1e-6)
-    guess = (centres + axes * spread).mean(0)
+    ahead = _depth_of_points(capture, centres, axes)
+    guess = (centres + axes * (spread if ahead is None else ahead)).mean(0)
     hold = 1e-3 * len(centres)
     centre = torch.linalg.solve(across.sum(0) + hold * eye, (across @ centres[:, :, None]).sum(0)[:, 0] + hold * guess)
+    if ahead is not None and float(((centre - centres) * axes).sum(-1).median()) < 0.3 * ahead:
+        centre = guess  # the axes cross by chance, among the cameras or behind them
     distance = (centres - centre).norm(dim=-1).median()
     return Contraction(centre.float(), float(distance) * 0.6)
+
+
+def _depth_of_points(capture: Capture, centres: Tensor, axes: Tensor, most: int = 5000) -> Tensor | None:
+    """How far before the cameras the reconstruction's points usually lie; None without points."""
+    points = capture.points[:: max(1, len(capture.points) // most)].double()
+    depths = ((points[None] - centres[:, None]) * axes[:, None]).sum(-1)
+    return depths[depths > 0].median() if len(points) >= 20 and (depths > 0).any() else None
 
 
 def _finest_for(frames: tuple[Frame, ...], contraction: Contraction, log2_table: int) -> int:

@@ -32,7 +32,7 @@ def render_rays(field: Field, rays: Rays, jitter: bool = False) -> Rendering:
 def render_many(field: Field, rays: Rays, chunk: int = CHUNK) -> Rendering:
     """:func:`render_rays` without gradients, chunk by chunk."""
     with torch.no_grad():
-        parts = [render_rays(field, rays[i : i + chunk]) for i in range(0, len(rays), chunk)]
+        parts = [render_rays(field, rays[i : i + chunk]) for i in range(0, max(len(rays), 1), chunk)]
     return Rendering(
         torch.cat([p.rgb for p in parts]),
         torch.cat([p.depth for p in parts]),

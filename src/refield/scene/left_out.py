@@ -58,7 +58,7 @@ class LeftOut:
         if len(missing) == total:
             what = f"none of its {total} images exists ({named(missing)})"
             raise InputError(where, what, "put the images beside it, or correct their paths")
-        if len(unreadable) > UNREADABLE_SHARE * total:
+        if len(unreadable) > UNREADABLE_SHARE * (total - len(missing)):
             what = f"{len(unreadable)} of {total} images cannot be read ({named(unreadable)}: {self.reason})"
             raise InputError(where, what, "replace them or remove their frames")
         for names, fault in ((missing, "missing"), (unreadable, f"unreadable ({self.reason})")):

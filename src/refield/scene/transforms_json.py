@@ -71,9 +71,8 @@ def load_cameras(path: Path, *, warn: Warn = log_warning) -> list[Frame]:
     json_path, data = _read(path)
     frames = []
     for entry in _unique(json_path, data, warn):
-        image = _find_image(json_path, entry)
-        known = image is None or ("w" in entry and "h" in entry)
-        size = None if known or image is None else images.read_size(image)
+        image = None if "w" in entry and "h" in entry else _find_image(json_path, entry)
+        size = None if image is None else images.read_size(image)
         frames.append(_frame(json_path, entry, image or json_path.parent / entry["file_path"], size))
     return frames
 

@@ -83,6 +83,8 @@ class HelperTraining:
                 if len(looks) > n and max(looks[-n:]) < max(looks[:-n]) + c.least_gain:
                     self.why_stopped = "held-out pixels stopped gaining"
                     break
+        if looks and self.steps_done % c.check_every and self.psnr(self.judge) >= max(looks):
+            best = {}  # the last steps, after the last look, were the best
         if best:
             self.helper.load_state_dict(best)
         self.occupancy.settle()

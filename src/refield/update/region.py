@@ -14,6 +14,8 @@ from refield.field.warp import inside_box, outline
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
 
+_CHUNK = 65536  # rays
+
 
 @dataclass(frozen=True)
 class Region:
@@ -62,7 +64,8 @@ class Region:
 
 def meets(sampler: OccupancySampler, rays: Rays) -> Tensor:
     """Whether each of N rays passes an occupied cell, (N,) bool."""
-    return sampler(rays).ray_offsets.diff() > 0
+    parts = [sampler(rays[i : i + _CHUNK]) for i in range(0, max(len(rays), 1), _CHUNK)]
+    return torch.cat([p.ray_offsets.diff() for p in parts]) > 0
 
 
 def move_out(change: SceneChange, factor: float) -> Region:
