@@ -19,6 +19,7 @@ from refield.scene import pose
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame
 from refield.scene.images import write_image
+from tests.fields import oracle_sampler
 
 SPACE = Contraction(torch.tensor([0.0, 0.0, 0.2]), 1.4)
 STEP = 0.02
@@ -58,9 +59,7 @@ class BoxWorld:
 
     @cached_property
     def sampler(self) -> OccupancySampler:
-        found = OccupancySampler.from_density(self.density, SPACE, STEP, resolution=64)
-        grown = functional.max_pool3d(found.grid[None, None].float(), 3, 1, 1)[0, 0]
-        return replace(found, grid=grown.to(torch.uint8))
+        return oracle_sampler(self.density, SPACE, STEP)
 
     def density(self, x: Tensor) -> Tensor:
         solid = (x[..., 2] <= 0) & (x[..., 2] >= -0.08) & (x[..., :2].abs() < FLOOR).all(-1)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from refield.field.encoding import Contraction
 from refield.field.sampling import OccupancySampler
@@ -15,6 +14,7 @@ from refield.scene import pose
 from refield.scene.camera import Camera
 from refield.scene.capture import Rays, camera_rays
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
+from tests.fields import oracle_sampler
 
 SPACE = Contraction(torch.zeros(3), 1.5)
 STEP = 0.025
@@ -40,10 +40,7 @@ class BallWorld:
 
     @cached_property
     def sampler(self) -> OccupancySampler:
-        found = OccupancySampler.from_density(self.density, SPACE, STEP, resolution=64)
-        # random probes miss the corners of hard edges; these fields are oracles and may not
-        grown = functional.max_pool3d(found.grid[None, None].float(), 3, 1, 1)[0, 0]
-        return replace(found, grid=grown.to(torch.uint8))
+        return oracle_sampler(self.density, SPACE, STEP)
 
     def density(self, x: Tensor) -> Tensor:
         return self(x, torch.zeros_like(x))[0]

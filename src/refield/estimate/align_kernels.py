@@ -1,8 +1,8 @@
 """The hot loop of registration: coloured points against photos, many poses at once (numba).
 
 Letters: V views, N points, K poses. A pose is R (3, 3) and c (3,): a point p of the old object is now at
-``R (p - p0) + c``, p0 the old centre. A view's lens is 25 numbers: cam_from_world R (9) and t (3), fx fy cx cy,
-k1 k2 p1 p2 k3, height, width, and its centre in the world's first two free slots (see `lens_of`).
+``R (p - p0) + c``, p0 the old centre. A view's lens is 26 numbers: cam_from_world R (9) and t (3), fx fy cx cy,
+k1 k2 p1 p2 k3, height, width, and its centre in the world (see `lens_of`).
 """
 
 from __future__ import annotations
@@ -88,6 +88,15 @@ def _facing(lens: _F64, p: _F64) -> tuple[float, float]:
 
 
 @njit(cache=True, fastmath=True)
+def _seen(lens: _F64, depth: _F32, p: _F64, radius: float, at: _F64) -> float:
+    """How squarely a view sees a placed point (the cosine), with `_project`'s ``at``; 0 if not well or not at all."""
+    cosine, distance = _facing(lens, p)
+    if cosine < 0.2 or not _project(lens, p[0], p[1], p[2], at):
+        return 0.0
+    return cosine if distance <= depth[int(at[1]), int(at[0])] + 0.3 * radius else 0.0
+
+
+@njit(cache=True, fastmath=True)
 def _gains(
     points: _F64, sides: _I64, colours: _F32, lenses: _F64, images: _F32, depths: _F32, r: _F64, c: _F64, radius: float
 ) -> _F64:
@@ -100,10 +109,8 @@ def _gains(
     for n in range(points.shape[0]):
         _place(points, n, r, c, p)
         for v in range(lenses.shape[0]):
-            cosine, distance = _facing(lenses[v], p)
-            if cosine < 0.2 or not _project(lenses[v], p[0], p[1], p[2], at):
-                continue
-            if distance > depths[v, int(at[1]), int(at[0])] + 0.3 * radius:
+            cosine = _seen(lenses[v], depths[v], p, radius, at)
+            if cosine == 0.0:
                 continue
             _sample(images[v], at[0], at[1], px)
             for k in range(3):
@@ -137,10 +144,8 @@ def _step(
         _place(points, n, r, c, p)
         for v in range(lenses.shape[0]):
             lens = lenses[v]
-            cosine, distance = _facing(lens, p)
-            if cosine < 0.2 or not _project(lens, p[0], p[1], p[2], at):
-                continue
-            if distance > depths[v, int(at[1]), int(at[0])] + 0.3 * radius:
+            cosine = _seen(lens, depths[v], p, radius, at)
+            if cosine == 0.0:
                 continue
             _sample(images[v], at[0], at[1], px)
             size = 0.0

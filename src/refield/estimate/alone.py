@@ -9,8 +9,8 @@ from refield.estimate.look import Seen, shaded
 from refield.estimate.objects import Old
 from refield.field.radiance import Field
 from refield.field.volrend import Samples
+from refield.field.warp import crossing
 from refield.scene.capture import Rays
-from refield.scene.change import OccupancyGrid
 from refield.scene.pose import invert, rotate, transform
 
 
@@ -24,8 +24,7 @@ def object_alone(field: Field, old: Old, rays: Rays, new_from_old: Tensor) -> Se
     there = Rays(transform(old_from_new, rays.origins), rotate(old_from_new, rays.directions))
     n = len(rays)
     rgb, depth, opacity = torch.zeros(n, 3), torch.full((n,), torch.inf), torch.zeros(n)
-    grid = old.grid()
-    near, far = crossing(grid, there)
+    near, far = crossing(there, old.grid.tight_aabb())
     hit = (far > near).nonzero()[:, 0]
     if len(hit) == 0:
         return Seen(rgb, depth, opacity)
@@ -35,7 +34,7 @@ def object_alone(field: Field, old: Old, rays: Rays, new_from_old: Tensor) -> Se
     middle = (samples.t_starts + samples.t_ends) / 2
     keep = ((middle > near[hit][ids]) & (middle < far[hit][ids])).nonzero()[:, 0]
     x = there.origins[ids[keep]] + there.directions[ids[keep]] * middle[keep, None]
-    inside = grid.contains(x)
+    inside = old.grid.contains(x)
     keep, x = keep[inside], x[inside]
     counts = torch.bincount(ids[keep], minlength=len(hit))
     offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
@@ -45,12 +44,3 @@ def object_alone(field: Field, old: Old, rays: Rays, new_from_old: Tensor) -> Se
         seen = shaded(field, (x, along), field.density(x), own)
     rgb[hit], depth[hit], opacity[hit] = seen.rgb, seen.depth, seen.opacity
     return Seen(rgb, depth, opacity)
-
-
-def crossing(grid: OccupancyGrid, rays: Rays) -> tuple[Tensor, Tensor]:
-    """Distances (N,) at which rays enter and leave a grid's tight box; a ray misses if it does not enter first."""
-    lo, hi = grid.tight_aabb()
-    d = rays.directions
-    inverse = 1 / torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
-    a, b = (lo - rays.origins) * inverse, (hi - rays.origins) * inverse
-    return torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)

@@ -18,7 +18,7 @@ from refield.estimate.objects import Old
 from refield.estimate.pose_change import PoseChange
 from refield.scene.capture import Frame
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
-from refield.scene.pose import adjoint, angle_between, transform
+from refield.scene.pose import adjoint, angle_between, rigid, transform
 from refield.vision import pixels
 
 
@@ -37,7 +37,7 @@ def concluded(
         reasons.append(_why_moved(olds[k], change))
     for k, share in settled.removed.items():
         masks = segment.masks_out(frames, olds[k])
-        changes.append(ObjectChange("removed", olds[k].grid(), masks=masks, confidence=share))
+        changes.append(ObjectChange("removed", olds[k].grid, masks=masks, confidence=share))
         reasons.append(f"1 removed: {100 * share:.0f} % of its pixels show what is behind it")
     for part in settled.arrived:
         grid = _newcomer(carved.lattice, part)
@@ -50,17 +50,14 @@ def concluded(
 
 
 def _moved(frames: Sequence[Frame], old: Old, change: PoseChange) -> ObjectChange:
-    grid = old.grid()
     centre = transform(change.new_from_old, torch.from_numpy(old.centre).double())
-    about_origin = torch.eye(4, dtype=torch.float64)
-    about_origin[:3, 3] = centre
-    about = adjoint(about_origin)
+    about = adjoint(rigid(torch.eye(3, dtype=torch.float64), centre))
     return ObjectChange(
         "moved",
-        grid,
+        old.grid,
         change.new_from_old,
         segment.masks_out(frames, old),
-        segment.masks_in(frames, grid.moved(change.new_from_old)),
+        segment.masks_in(frames, old.grid.moved(change.new_from_old)),
         confidence=change.explained,
         covariance=about @ change.covariance @ about.T,
         note=change.note,

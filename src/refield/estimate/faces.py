@@ -18,8 +18,7 @@ from refield.estimate.detect import Changed, Mask
 from refield.estimate.hull import Hull
 from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.look import Array, View
-from refield.vision import pixels
-from refield.vision.segmenter import Segmenter
+from refield.vision.segmenter import Segmenter, cut_out
 
 _JUMP = 5.0  # pixels' widths; a surface that is fitted well bends by less from one pixel to the next
 _SHARED = 0.3  # of the smaller of two faces' voxels, for them to be one
@@ -54,11 +53,7 @@ def changed_parts(
         mine = solid & (label == k) & (carved.behind < width)
         parts = [p for p in components(mine, smallest) if (p & face).any()]
         (things if k <= len(own) else others).extend(parts)
-    return sorted(things, key=_voxels_less), sorted(others, key=_voxels_less)
-
-
-def _voxels_less(part: Voxels) -> int:
-    return -int(part.sum())
+    return sorted(things, key=np.sum, reverse=True), sorted(others, key=np.sum, reverse=True)
 
 
 def _things_in(c: Changed, segmenter: Segmenter) -> Mask:
@@ -67,9 +62,7 @@ def _things_in(c: Changed, segmenter: Segmenter) -> Mask:
     if count == 0:
         return c.mask
     hints = np.stack([label == k for k in range(1, count + 1)])
-    boxes = np.array([pixels.bounding_box(h) for h in hints], np.float64)
-    image = (np.clip(c.view.rgb, 0, 1) * 255).astype(np.uint8)
-    return np.logical_or.reduce(segmenter.masks(image, boxes, hints)[0])
+    return cut_out(segmenter, c.view.rgb, hints)
 
 
 def _faces_in(view: View, mask: Mask, lattice: Lattice, allowed: Voxels) -> list[Voxels]:

@@ -43,10 +43,8 @@ def matched_poses(
         there = _features_in(p.view.photo, pixels.dilate(p.changed.mask, 1), matcher)
         uv, xyz = [], []
         for descriptors, points in known:
-            a, b, _ = matcher.match_features((points[:, :2], descriptors), there)
-            # the first two columns name the point: look the third up again
-            index = {(float(q[0]), float(q[1])): k for k, q in enumerate(points)}
-            xyz += [points[index[(float(q[0]), float(q[1]))], 2:] for q in a]
+            a, b, _ = matcher.match_features((points, descriptors), there)
+            xyz += list(a[:, 2:])
             uv += list(b)
         pose = camera_from_object(np.array(uv), np.array(xyz), p.view.camera, least)
         if pose is not None:
@@ -72,7 +70,7 @@ def _features_in(image: Array, mask: Mask, matcher: SiftMatcher) -> Features:
     if box is None or mask.sum() < 30:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
     x0, y0, x1, y1 = box
-    crop = (np.clip(image[y0:y1, x0:x1], 0, 1) * 255).astype(np.uint8)
+    crop = pixels.to_bytes(image[y0:y1, x0:x1])
     scale = float(np.clip(_CROP / max(crop.shape[:2]), 1, 3))
     if scale > 1:
         crop = np.asarray(cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC), np.uint8)

@@ -107,7 +107,7 @@ class Old:
     def outlook(self) -> Outlook:
         """The directions along which old photos looked at it."""
         eyes = torch.from_numpy(np.stack([p.centre for p in self.patches]))
-        return Outlook.from_eyes(eyes, self.grid())
+        return Outlook.from_eyes(eyes, self.grid)
 
     @cached_property
     def _sides(self) -> tuple[cKDTree, NDArray[np.int64], float]:
@@ -126,6 +126,7 @@ class Old:
     def volume(self) -> float:
         return float(self.voxels.sum()) * self.lattice.cell**3
 
+    @cached_property
     def grid(self) -> OccupancyGrid:
         """Its mask M: with the whole of the field's soft surface, which is as thick as its samples are apart, and a
         little smoothed, so that the trilinear half level is not a staircase."""

@@ -19,7 +19,7 @@ from refield.estimate.objects import Old, Patch, corners_of, look_around, surfac
 from refield.field.radiance import Field
 from refield.scene.capture import Frame
 from refield.vision import pixels
-from refield.vision.segmenter import Segmenter
+from refield.vision.segmenter import Segmenter, cut_out
 
 
 @dataclass(frozen=True)
@@ -121,11 +121,9 @@ def _cut_out(
     near = grown(voxels, 1)
     for p in patches:
         hint = pixels.close(lattice.holds(near, p.points), 3)
-        box = pixels.bounding_box(hint)
-        if box is None or hint.sum() < 12:
+        if hint.sum() < 12:
             continue
-        image = (np.clip(p.rgb, 0, 1) * 255).astype(np.uint8)
-        mask = segmenter.masks(image, np.array([box], np.float64), hint[None])[0][0]
+        mask = cut_out(segmenter, p.rgb, hint[None])
         where, inside = p.pixel_of(torch.from_numpy(points))
         behind = p.behind_surface(torch.from_numpy(points)).numpy()
         seen = inside.numpy() & (behind < thick)

@@ -25,7 +25,7 @@ from refield.estimate.past import Past
 from refield.field.radiance import Field
 from refield.scene.camera import Camera
 from refield.scene.capture import Rays
-from refield.scene.pose import exp, invert, skew, transform
+from refield.scene.pose import exp, invert, rigid, skew, transform
 from refield.vision import pixels
 
 
@@ -243,17 +243,15 @@ class Refiner:
     def moved(self, new_from_old: Tensor, twist: Tensor) -> Tensor:
         """T turned and shifted by a twist about the object's current centre."""
         c = transform(new_from_old, self.centre)
-        step = exp(twist)
-        shift = torch.eye(4, dtype=torch.float64)
-        shift[:3, 3] = c
-        return shift @ step @ invert(shift) @ new_from_old
+        shift = rigid(torch.eye(3, dtype=torch.float64), c)
+        return shift @ exp(twist) @ invert(shift) @ new_from_old
 
 
 def refiner(
     field: Field, old: Old, past: Sequence[Past], olds: Sequence[Old], start: Tensor, config: RefineConfig
 ) -> Refiner:
     """Prepare the photos around the place where ``start`` puts the object."""
-    corners = transform(start, torch.cartesian_prod(*old.grid().tight_aabb().T.double())).numpy()
+    corners = transform(start, torch.cartesian_prod(*old.grid.tight_aabb().T.double())).numpy()
     boxes = []
     for p in past:
         box = box_in(p.view.frame.camera, p.view.frame, corners, config.margin)

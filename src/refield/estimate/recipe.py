@@ -135,7 +135,7 @@ def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
     near = np.concatenate([c.view.surface[c.mask & np.isfinite(c.view.depth)] for c in changed])
     points = np.concatenate([v.surface.reshape(-1, 3) for v in survey])
     points = points[np.isfinite(points).all(-1)]
-    if len(near) < 20 or len(points) < 50:
+    if len(near) < 20:
         return []
     low, high = np.quantile(near, 0.05, axis=0), np.quantile(near, 0.95, axis=0)
     pad = 0.3 * float((high - low).max())

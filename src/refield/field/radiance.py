@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from refield.field import kernels
 from refield.field.encoding import Contraction, HashGrid, geometric_levels
+from refield.field.kernels.reference import DensityNet
 from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
@@ -103,8 +104,12 @@ class HashField(nn.Module):
 
     def samples(self, rays: Rays, jitter: bool = False) -> Samples:
         """Where to evaluate the field along rays: the sampler's places, ended behind the first opaque surface."""
-        net = (self.encoding.tables, self.encoding.resolutions, self.density_in, self.density_out[0])
-        return self.sampler.visible(rays, net, jitter)
+        return self.sampler.visible(rays, self.density_net, jitter)
+
+    @property
+    def density_net(self) -> DensityNet:
+        """What marching needs to know the density: tables, their resolutions, and the network's two layers."""
+        return self.encoding.tables, self.encoding.resolutions, self.density_in, self.density_out[0]
 
     def _hidden(self, flat: Tensor) -> Tensor:
         return functional.relu(functional.linear(self.encoding(self.contraction(flat)), self.density_in))

@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn import functional
 
+from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.pose import invert, rotate, transform
 
@@ -157,3 +158,10 @@ def inside_box(x: Tensor, box: Tensor) -> Tensor:
     """World points (..., 3), world box (2, 3) -> (...,) bool."""
     lo, hi = box.to(x.device, x.dtype)
     return ((x >= lo) & (x <= hi)).all(-1)
+
+
+def crossing(rays: Rays, box: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances (N,) at which rays enter and leave a world box (2, 3); a ray misses it if it does not enter first."""
+    inverse = 1 / torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)
+    a, b = (box[0] - rays.origins) * inverse, (box[1] - rays.origins) * inverse
+    return torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)

@@ -16,7 +16,7 @@ from refield.field.radiance import Field, HashField
 from refield.field.render import visible_samples
 from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples
-from refield.field.warp import Move, Outlook, inside_box, looked_up, moves_of, owners
+from refield.field.warp import Move, Outlook, crossing, inside_box, looked_up, moves_of, owners
 from refield.scene.capture import Rays
 from refield.scene.change import SceneChange
 from refield.update.light import Relighting
@@ -86,9 +86,7 @@ class UpdatedField:
         if self._base is None or not self._marched:
             return visible_samples(self.pretrained, rays, jitter) if not self.boxes else self.sampler(rays, jitter)
         known = replace(self.sampler, grid=self.sampler.grid * (1 - self._retold))
-        base = self._base
-        net = (base.encoding.tables, base.encoding.resolutions, base.density_in, base.density_out[0])
-        return interleaved(known.visible(rays, net, jitter), self._retold_samples(rays, jitter))
+        return interleaved(known.visible(rays, self._base.density_net, jitter), self._retold_samples(rays, jitter))
 
     def _retold_samples(self, rays: Rays, jitter: bool) -> Samples:
         """All samples in cells that changed; only the rays that come near any are marched, and no further."""
@@ -203,10 +201,8 @@ def _by_cells(sampler: OccupancySampler, box: Tensor) -> Tensor:
 
 def leaving(rays: Rays, box: Tensor) -> Tensor:
     """Distance at which each ray leaves a world box, (N,); 0 if it does not meet it."""
-    inverse = 1 / torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)
-    a, b = (box[0] - rays.origins) * inverse, (box[1] - rays.origins) * inverse
-    enter, leave = torch.minimum(a, b).amax(-1), torch.maximum(a, b).amin(-1)
-    return torch.where((leave > enter) & (leave > 0), leave, 0.0)
+    enter, leave = crossing(rays, box)
+    return torch.where(leave > enter, leave, 0.0)
 
 
 def interleaved(a: Samples, b: Samples) -> Samples:

@@ -58,7 +58,7 @@ class SiftMatcher:
         a: tuple[NDArray[np.float64], NDArray[np.float32]],
         b: tuple[NDArray[np.float64], NDArray[np.float32]],
     ) -> Matches:
-        """The same from features already found."""
+        """The same from features already found; what follows a point's two pixel coordinates goes along with it."""
         if min(len(a[0]), len(b[0])) < 2:
             return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
         similar = a[1] @ b[1].T

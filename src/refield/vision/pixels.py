@@ -24,6 +24,11 @@ def blur(image: Image, sigma: float) -> Image:
     return cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101)
 
 
+def to_bytes(image: Image) -> NDArray[np.uint8]:
+    """[0, 1] -> 0-255, what segmenters and matchers take."""
+    return (np.clip(image, 0, 1) * 255).astype(np.uint8)
+
+
 def to_lab(image: Image) -> Image:
     """sRGB -> CIE Lab, L in 0-100: a difference of 1 is just visible."""
     return cv2.cvtColor(np.clip(image, 0, 1).astype(np.float32), cv2.COLOR_RGB2LAB)

@@ -28,6 +28,13 @@ class Segmenter(Protocol):
         ...
 
 
+def cut_out(segmenter: Segmenter, image: pixels.Image, hints: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """What a segmenter finds of an image (H, W, 3) in [0, 1] in the boxes around hints (B, H, W), together, (H, W)."""
+    boxes = np.array([pixels.bounding_box(h) for h in hints], np.float64)
+    masks, _ = segmenter.masks(pixels.to_bytes(image), boxes, hints)
+    return np.logical_or.reduce(masks)
+
+
 @dataclass(frozen=True)
 class GrabCutSegmenter:
     """Colour models inside and outside a box, cut along edges (Rother et al. 2004)."""
