@@ -11,7 +11,7 @@ import torch
 from refield.scene.capture import Capture, camera_rays
 from refield.scene.colmap import PARAMETERS, load_colmap, save_colmap
 from refield.scene.errors import InputError
-from refield.scene.load import load_capture
+from refield.scene.load import load_capture, load_new_photos
 from tests.captures import CAMERA, DISTORTED, write_capture
 from tests.conftest import HERE
 
@@ -133,3 +133,12 @@ def test_pycolmap_does_not_take_our_signals(tmp_path):
     save_colmap(tmp_path / "sparse" / "0", capture_with_points(tmp_path))
     done = subprocess.run([sys.executable, "-c", _TERMINATED, str(tmp_path)], env=HERE, stderr=subprocess.DEVNULL)
     assert done.returncode == 77
+
+
+def test_new_photos_as_a_model_are_told_what_is_read(tmp_path):
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    (tmp_path / "sparse" / "0" / "cameras.txt").touch()
+    (tmp_path / "sparse" / "0" / "images.txt").touch()
+    (tmp_path / "sparse" / "0" / "points3D.txt").touch()
+    with pytest.raises(InputError, match=r"COLMAP model, which is read for first photos only; give a transforms\.json"):
+        load_new_photos(tmp_path, Capture(()))
