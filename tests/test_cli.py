@@ -201,6 +201,17 @@ def test_signals_leave_no_half_workspace(place, number, code):
     assert not (place / "out").exists()
 
 
+def test_an_interrupt_within_generated_code_has_the_same_exit_code(place):
+    # numba's compiler runs source text; CPython remembers a KeyboardInterrupt that passes through it
+    code = """import sys, refield.cli
+text = "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(5)"
+refield.cli._command = lambda arguments: exec(text)
+sys.exit(refield.cli.main(["train"]))"""
+    (place / "interrupted.py").write_text(code)
+    done = subprocess.run([sys.executable, "-m", "interrupted"], cwd=place, env=HERE, stderr=subprocess.DEVNULL)
+    assert done.returncode == 130
+
+
 def test_a_killed_training_is_no_workspace_and_can_be_repeated(place):
     process = training(place)
     process.kill()

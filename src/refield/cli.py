@@ -30,8 +30,10 @@ _DISK = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM, errno.EDQUOT)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    previous = signal.getsignal(signal.SIGTERM)
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
+        if previous[signal.SIGINT] is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _interrupt)
         return _command(arguments)
     except InputError as error:
         return _fail(str(error), INPUT)
@@ -45,7 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         what = f"{error.filename or 'the disk'}: {error.strerror}; check permissions and free space"
         return _fail(what, INPUT)
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def _command(arguments: list[str]) -> int:
@@ -80,6 +83,15 @@ def _fail(message: str, code: int) -> int:
     one_line = " ".join(message.split())
     print(f"refield: {one_line}", file=sys.stderr)
     return code
+
+
+class _Interrupted(KeyboardInterrupt):
+    """Ctrl-C. Of a plain KeyboardInterrupt that passes through an ``exec`` of source text (numba's compiler has some)
+    CPython dies at the very end, although it was caught; one of another type has no such effect."""
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise _Interrupted
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:
