@@ -125,7 +125,9 @@ def test_adam_and_scatter_max() -> None:
     for twin in (reference, cpu):
         p, m, v = torch.ones(2, 64, 2), torch.zeros(2, 64, 2), torch.zeros(2, 64, 2)
         for step in (1, 2, 3):
-            twin.adam(p, grad, m, v, 1e-2, step)
+            once = grad.clone()
+            twin.adam(p, once, m, v, 1e-2, step)
+            assert not once.any()  # cleared for the next step
         into = torch.zeros(50)
         twin.scatter_max(torch.linspace(0, 1, 200), torch.arange(200) * 7 % 50, into)
         states.append((p, m, v, into))
@@ -148,3 +150,86 @@ def test_contraction_and_harmonics() -> None:
     ring = torch.nn.functional.normalize(torch.randn(200_000, 3), dim=-1)
     gram = cpu.spherical_harmonics(ring).T @ cpu.spherical_harmonics(ring) * (4 * torch.pi / len(ring))
     torch.testing.assert_close(gram, torch.eye(16), rtol=0, atol=0.05)  # orthonormal on the sphere
+
+
+def networks(levels: int, width: int, k: int) -> tuple[Tensor, ...]:
+    shapes = [(width, 2 * levels), (1 + k, width), (width, k + 16), (width, width), (3, width)]
+    return tuple((torch.rand(rows, columns) * 2 - 1) * (6 / columns) ** 0.5 for rows, columns in shapes)
+
+
+def close(fast: Tensor, truth: Tensor) -> None:
+    assert fast.shape == truth.shape
+    if truth.numel() == 0:
+        return
+    torch.testing.assert_close(fast, truth, rtol=1e-3, atol=2e-4 * float(truth.abs().max()) + 1e-8)
+
+
+@pytest.mark.parametrize("levels, width, k", [(10, 32, 15), (3, 8, 2), (9, 48, 16), (1, 64, 31)])
+@pytest.mark.parametrize("samples", [0, 1, 7, 128, 1001])
+def test_hash_field(levels: int, width: int, k: int, samples: int) -> None:
+    torch.manual_seed(7)
+    resolutions = geometric_levels(4, 200, levels)
+    nets, tables = networks(levels, width, k), torch.randn(levels, 1 << 10, 2)
+    unit, d = torch.rand(samples, 3), torch.nn.functional.normalize(torch.randn(samples, 3), dim=-1)
+    up_raw, up_rgb = torch.randn(samples), torch.randn(samples, 3)
+    results = []
+    for twin in (reference, cpu):
+        leaves = [p.clone().requires_grad_() for p in (tables, *nets)]
+        raw, rgb = twin.hash_field(unit, d, leaves[0], resolutions, tuple(leaves[1:]))
+        total = (raw * up_raw).sum() + (rgb * up_rgb).sum()
+        results.append((raw.detach(), rgb.detach(), *torch.autograd.grad(total, leaves)))
+    for truth, fast in zip(*results):
+        close(fast, truth)
+
+
+@pytest.mark.parametrize("fill, scale, rays", [(0.05, 1.0, 300), (1.0, 3.0, 257), (0.0, 1.0, 20), (0.3, 0.0, 64)])
+def test_train_step(fill: float, scale: float, rays: int) -> None:
+    """The fused step against the same step by autograd: haze and surfaces, long rays, empty ones, a miss of all."""
+    torch.manual_seed(8)
+    resolutions = geometric_levels(8, 64, 4)
+    nets, tables = networks(4, 16, 7), torch.randn(4, 1 << 12, 2) * scale
+    origins = torch.nn.functional.normalize(torch.randn(rays, 3), dim=-1) * 3
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3) * 0.5 - origins, dim=-1)
+    batch = reference.Batch((origins, directions, torch.rand(rays)), torch.rand(rays, 3), torch.rand(rays, 3))
+    grid = (torch.rand(32, 32, 32) < fill).to(torch.uint8)
+    results = []
+    for twin in (reference, cpu):
+        into = [torch.zeros_like(p) for p in (tables, *nets)]
+        space = (torch.tensor([0.1, 0.0, 0.2]), 1.5)
+        field = (tables, resolutions, nets)
+        aim = reference.Aim(distortion=0.3, gradient_unit=2.5, stop=7.0)
+        results.append((twin.train_step(batch, space, grid, (0.0, 60.0, 0.05), field, aim, into), into))
+    (truth, true_grads), (fast, grads) = results
+    assert fast.rays == truth.rays and fast.loss == pytest.approx(truth.loss, rel=1e-4)
+    # a sample on the border of two cells, or at the very end of a ray, may fall to either side
+    assert abs(len(fast.weights) - len(truth.weights)) <= 0.002 * len(truth.weights)
+    close(fast.weights.sort().values[-50:], truth.weights.sort().values[-50:])
+    difference = fast.cells.bincount(minlength=32**3) - truth.cells.bincount(minlength=32**3)
+    assert difference.abs().sum() <= 4 + 0.01 * len(truth.cells)
+    for mine, true in zip(grads, true_grads):
+        assert (mine - true).norm() <= 1e-2 * true.norm()
+
+
+def test_train_step_is_the_same_bit_for_bit_for_any_number_of_threads() -> None:
+    import numba
+
+    before, results = numba.get_num_threads(), []
+    try:
+        for threads in {1, before}:
+            numba.set_num_threads(threads)
+            torch.manual_seed(9)
+            nets, tables = networks(4, 32, 15), torch.randn(4, 1 << 12, 2)
+            batch = reference.Batch(
+                (torch.rand(700, 3), torch.nn.functional.normalize(torch.randn(700, 3), dim=-1), torch.rand(700)),
+                torch.rand(700, 3),
+                torch.rand(700, 3),
+            )
+            into = [torch.zeros_like(p) for p in (tables, *nets)]
+            grid, aim = torch.ones(16, 16, 16, dtype=torch.uint8), reference.Aim(0.1, 1.0, 7.0)
+            field = (tables, geometric_levels(8, 64, 4), nets)
+            done = cpu.train_step(batch, (torch.zeros(3), 1.0), grid, (0.0, 50.0, 0.05), field, aim, into)
+            results.append([done.weights, done.sigmas, torch.tensor(done.loss), *into])
+    finally:
+        numba.set_num_threads(before)
+    for a, b in zip(results[0], results[-1]):
+        assert torch.equal(a, b)

@@ -61,7 +61,7 @@ def photos(world: Field, folder: Path, turns: list[float], height: float = 1.6) 
 def case(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, SceneChange]:
     folder = tmp_path_factory.mktemp("update")
     old = photos(BEFORE, folder / "before", [0.5 * i for i in range(12)])
-    new = photos(AFTER, folder / "after", [0.3 + 1.57 * i for i in range(4)])
+    new = photos(AFTER, folder / "after", [0.3 + math.tau / 6 * i for i in range(6)])
     placed = tuple(PlacedPhoto(f.name, "used", frame=f) for f in new)
     return Capture(old), SceneChange((moved(OLD, NEW_POSE),), placed)
 

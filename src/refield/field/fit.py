@@ -13,13 +13,12 @@ from torch import Tensor
 from refield.field import kernels
 from refield.field.coverage import knowable
 from refield.field.encoding import Contraction
-from refield.field.losses import colour_loss, distortion_loss, scale_gradients
+from refield.field.kernels.reference import Aim, Batch
 from refield.field.occupancy import OccupancyTrainer
 from refield.field.pixels import PixelBank
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_many
-from refield.field.sampling import OccupancySampler
-from refield.field.volrend import accumulate_rgb, weights
+from refield.field.sampling import STOP, OccupancySampler
 from refield.scene.capture import Capture, Frame, Rays
 
 
@@ -69,11 +68,14 @@ class FitProgress:
 
 
 class NonFiniteError(RuntimeError):
-    """The loss stayed infinite or NaN for too long."""
+    """The loss or its gradient stayed infinite or NaN for too long."""
+
+    field: HashField | None = None
+    """the last good state, ready for use, where :func:`fit_field` raises this"""
 
 
 ProgressCallback = Callable[[FitProgress], None]
-_BAD_STEPS = 20
+MOST_SKIPPED = 20  # steps in a row
 COARSEST = 1.5  # times the final step along the ray
 
 
@@ -84,7 +86,7 @@ def fit_field(
 
     Raises:
         ValueError: no frame to train on.
-        NonFiniteError: the loss was not finite for 20 steps in a row.
+        NonFiniteError: the loss or its gradient was not finite for 20 steps in a row; it holds the last good state.
     """
     torch.manual_seed(config.seed)
     contraction = place_contraction(capture)
@@ -94,7 +96,11 @@ def fit_field(
     step = 2 * contraction.radius * 4 / shape.finest  # about two pixels
     grid = torch.ones(128, 128, 128, dtype=torch.uint8)
     model = HashField(shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), config.seed)
-    _Fit(model, capture, config, on_progress).run()
+    try:
+        _Fit(model, capture, config, on_progress).run()
+    except NonFiniteError as error:
+        error.field = model.eval().requires_grad_(False)
+        raise
     return model.eval().requires_grad_(False)
 
 
@@ -138,26 +144,42 @@ def _finest_for(frames: tuple[Frame, ...], contraction: Contraction, log2_table:
 
 
 class TableAdam:
-    """Adam for the hash tables (rows without gradient rest) beside torch's for the small matrices."""
+    """Adam for a hash field: what has no gradient rests, in the tables as in the matrices."""
 
-    def __init__(self, model: HashField, rate: float) -> None:
-        self.tables = model.encoding.tables
-        self.first, self.second = torch.zeros_like(self.tables), torch.zeros_like(self.tables)
-        small = [p for p in model.parameters() if p is not self.tables]
-        self.small = torch.optim.Adam(small, lr=rate, betas=(0.9, 0.99), eps=1e-10, fused=True)
+    def __init__(self, model: HashField) -> None:
+        self.parameters = [model.encoding.tables, *model.networks]
+        self.grads = [torch.zeros_like(p) for p in self.parameters]
+        """where a step's gradients are added up; cleared by :meth:`step`"""
+        self.first, self.second = ([torch.zeros_like(p) for p in self.parameters] for _ in range(2))
         self.count = 0
+        self.skipped, self.in_a_row = 0, 0
+        """steps that were left out: all of them, and since the last that was not"""
 
-    def zero_grad(self) -> None:
-        self.small.zero_grad(set_to_none=True)
-        self.tables.grad = None
+    def backward(self, loss: Tensor) -> None:
+        """Add a loss' gradients, by autograd."""
+        for total, grad in zip(self.grads, torch.autograd.grad(loss, self.parameters, allow_unused=True)):
+            if grad is not None:
+                total += grad
 
-    def step(self, rate: float) -> None:
-        self.count += 1
-        for group in self.small.param_groups:
-            group["lr"] = rate
-        self.small.step()
-        if self.tables.grad is not None:
-            kernels.adam(self.tables, self.tables.grad, self.first, self.second, rate, self.count)
+    def step(self, rate: float, loss: float) -> bool:
+        """Take the step if the loss and its gradients are finite; else leave it out, and count it.
+
+        Raises:
+            NonFiniteError: that was the 20th in a row; the parameters are as the last sound step left them.
+        """
+        # a gradient that is not finite shows in the networks', through which all of it has gone
+        if not math.isfinite(loss) or not all(bool(g.isfinite().all()) for g in self.grads[1:]):
+            self.skipped, self.in_a_row = self.skipped + 1, self.in_a_row + 1
+            for grad in self.grads:
+                grad.zero_()
+            if self.in_a_row >= MOST_SKIPPED:
+                raise NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
+            return False
+        self.count, self.in_a_row = self.count + 1, 0
+        with torch.no_grad():
+            for p, grad, first, second in zip(self.parameters, self.grads, self.first, self.second):
+                kernels.adam(p, grad, first, second, rate, self.count)
+        return True
 
 
 class _Fit:
@@ -171,17 +193,28 @@ class _Fit:
         self.model, self.config, self.on_progress = model, config, on_progress
         self.pixels = PixelBank(capture.train)
         self.judge = HeldOut(capture.held_out)
-        self.adam = TableAdam(model, config.rate)
+        self.adam = TableAdam(model)
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, capture.train))
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
         self.samples_per_ray = config.samples / 512
         self.began = time.perf_counter()
-        self.rays_done, self.bad = 0, 0
-        self.finest_step, self.coarseness = model.sampler.step, COARSEST
+        self.rays_done = 0
+        self.finest_step, self.coarseness = model.sampler.step, 1.0
+        self._set_coarseness(COARSEST)
 
     def run(self) -> None:
         self.model.train()
+        try:
+            self._steps()
+        except NonFiniteError:
+            self.occupancy.settle(self.pixels)
+            raise
+        self.occupancy.settle(self.pixels)
+        if self.on_progress:
+            self._look(self.config.steps)
+
+    def _steps(self) -> None:
         looks: list[float] = []
         for step in range(self.config.steps):
             progress = self._progress(step)
@@ -192,9 +225,6 @@ class _Fit:
                 looks.append(self._look(step + 1))
                 if self._plateau(looks):
                     break
-        self.occupancy.settle(self.pixels)
-        if self.on_progress:
-            self._look(self.config.steps)
 
     def _progress(self, step: int) -> float:
         by_time = 0.0
@@ -203,34 +233,19 @@ class _Fit:
         return max(step / self.config.steps, by_time)
 
     def _step(self, step: int, progress: float) -> None:
-        self.model.sampler = replace(self.model.sampler, step=self.finest_step * self.coarseness)
-        chosen = torch.randint(len(self.pixels), (self.rays_per_step,))
+        n = self.rays_per_step
+        chosen = torch.randint(len(self.pixels), (n,))
         rays = self.pixels.rays(chosen)
-        samples = self.model.samples(rays, jitter=True)
-        x, d = samples.positions(rays)
-        radius = self.model.contraction.radius
-        sigmas, rgbs = self.model(x, d)
-        sigmas, rgbs = scale_gradients(sigmas, rgbs, samples, self.config.gradient_unit * radius)
-        w = weights(sigmas, samples)
-        rgb, opacity = accumulate_rgb(w, rgbs, samples)
         # what stays transparent is shown noise, so that only opaque surfaces explain the photos
-        rgb = rgb + (1 - opacity)[:, None] * torch.rand(len(rays), 3)
-        loss = colour_loss(rgb, self.pixels.colours(chosen))
-        loss = loss + self.config.distortion * distortion_loss(w, samples, radius)
-        self._descend(loss, progress)
-        self.occupancy.observe(step, x, w.detach(), sigmas.detach())
-        self._resize(len(rays), len(samples))
-
-    def _descend(self, loss: Tensor, progress: float) -> None:
-        if not math.isfinite(loss.item()):
-            self.bad += 1
-            if self.bad >= _BAD_STEPS:
-                raise NonFiniteError(f"the loss was not finite for {_BAD_STEPS} steps in a row")
-            return
-        self.bad = 0
-        self.adam.zero_grad()
-        loss.backward()
-        self.adam.step(self.config.rate * rate_factor(progress))
+        batch = Batch((rays.origins, rays.directions, torch.rand(n)), self.pixels.colours(chosen), torch.rand(n, 3))
+        model, sampler = self.model, self.model.sampler
+        space = (sampler.contraction.centre, sampler.contraction.radius)
+        aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
+        field = (model.encoding.tables, model.encoding.resolutions, model.networks)
+        done = kernels.train_step(batch, space, sampler.grid, sampler.lattice, field, aim, self.adam.grads)
+        self.adam.step(self.config.rate * rate_factor(progress), done.loss)
+        self.occupancy.observe(step, done.cells, done.weights, done.sigmas)
+        self._resize(n, len(done.weights))
 
     def _resize(self, rays: int, samples: int) -> None:
         """Aim at the wanted number of samples in the next step."""
@@ -247,6 +262,7 @@ class _Fit:
     def _set_coarseness(self, to: float) -> None:
         self.samples_per_ray *= self.coarseness / to
         self.coarseness = to
+        self.model.sampler = replace(self.model.sampler, step=self.finest_step * to)
 
     def _look(self, step: int) -> float:
         psnr = self.judge.psnr(self.model)

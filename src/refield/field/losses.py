@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from refield.field import kernels
+from refield.field.kernels.reference import scale_gradient
 from refield.field.volrend import Samples
 
 
@@ -20,20 +20,8 @@ def distortion_loss(weights: Tensor, samples: Samples, radius: float) -> Tensor:
     return kernels.distortion(weights, s0, s1, samples.ray_offsets).mean()
 
 
-class _ScaleGradient(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, x: Tensor, scale: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
-        ctx.save_for_backward(scale)
-        return x.view_as(x)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[no-untyped-def]
-        (scale,) = ctx.saved_tensors
-        return grad * (scale if grad.dim() == 1 else scale[:, None]), None
-
-
 def scale_gradients(sigmas: Tensor, rgbs: Tensor, samples: Samples, unit: float) -> tuple[Tensor, Tensor]:
     """Gradients times min((t / unit)^2, 1): few rays cross what is near a camera; it must not grow floaters (§10.1)."""
     mid = (samples.t_starts + samples.t_ends) / 2
     scale = (mid / unit).square().clamp(max=1.0)
-    return _ScaleGradient.apply(sigmas, scale), _ScaleGradient.apply(rgbs, scale)
+    return scale_gradient(sigmas, scale), scale_gradient(rgbs, scale)

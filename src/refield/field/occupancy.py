@@ -15,6 +15,10 @@ _EVERY = 16  # steps between updates
 _OPACITY = 5e-2  # a cell is kept if a sample in it would be more opaque than this
 _WEIGHT = 5e-3  # and if some ray gives it at least this much of its colour: hidden cells cost half of all samples
 _DECAY = 0.8
+_PROBED_AT_FIRST, _PROBED = 16, 64  # one in so many cells, each time
+# Core radii; from the core to here cameras stand (see `place_contraction`). What is there must show itself: with the
+# benefit of the doubt a photo's background is learnt as haze before the cameras opposite, and new views meet it
+_CAMERAS = 2.0
 _BACKGROUND = 5.0  # core radii; a cell that no ray ever crossed is taken for empty, unless it is further out
 
 
@@ -25,79 +29,73 @@ class OccupancyTrainer:
     taken for empty can come back.
     """
 
-    def __init__(self, model: HashField, cull_from: int = 128, allowed: Tensor | None = None) -> None:
-        """``allowed`` (R**3,) bool: cells that may hold something at all; all by default."""
+    def __init__(
+        self, model: HashField, cull_from: int = 128, allowed: Tensor | None = None, doubt: float = 2 * _OPACITY
+    ) -> None:
+        """``allowed`` (R**3,) bool: cells that may hold something at all; all by default. ``doubt``: the opacity that
+        cells begin with, except where cameras stand."""
         self.model, self.cull_from = model, cull_from
+        device = model.sampler.grid.device
         cells = model.sampler.resolution**3
-        self.allowed = torch.ones(cells, dtype=torch.bool) if allowed is None else allowed
-        self.opacity = torch.zeros(cells)
-        self.weight = torch.full((cells,), 16 * _WEIGHT)  # the benefit of the doubt
-        self.recent_weight = torch.full((cells,), -1.0)  # since the last update; -1: no sample fell here
-        self.recent_sigma = torch.zeros(cells)
-        distance = torch.cat([model.sampler.distance(c) for c in torch.arange(cells).split(1 << 20)])
-        self.visited = distance > _BACKGROUND
-        self.lengths = torch.cat([model.sampler.step_at(c) for c in torch.arange(cells).split(1 << 20)])
+        self.allowed = torch.ones(cells, dtype=torch.bool, device=device) if allowed is None else allowed
+        self.open = self.allowed.nonzero()[:, 0]
+        self.state = torch.zeros(cells, 4, device=device)
+        """see `kernels.reference.observe`"""
+        self.state[:, 1] = 16 * _WEIGHT  # the benefit of the doubt
+        for some in torch.arange(cells, device=device).split(1 << 20):
+            self.state[some, 2] = model.sampler.step_at(some)
+            distance = model.sampler.distance(some)
+            self.state[some, 0] = torch.where((distance > 1) & (distance < _CAMERAS), 0.0, doubt)
+            self.state[some, 3] = torch.where(distance > _BACKGROUND, 0.0, -1.0)
 
-    def observe(self, step: int, x: Tensor, w: Tensor, sigmas: Tensor) -> None:
-        """After each step: samples' positions (S, 3), weights (S,), densities (S,). Renews the grid every 16 steps."""
-        cells = self.model.sampler.cells(x)
-        kernels.scatter_max(w, cells, self.recent_weight)
-        kernels.scatter_max(sigmas, cells, self.recent_sigma)
+    @property
+    def weight(self) -> Tensor:
+        """(R**3,) the most that some ray gave each cell of late."""
+        return self.state[:, 1]
+
+    def observe(self, step: int, cells: Tensor, w: Tensor, sigmas: Tensor) -> None:
+        """After each step: samples' cells (S,), weights (S,), densities (S,). Renews the grid every 16 steps."""
+        kernels.observe(self.state, 1 + step // _EVERY, _DECAY, cells, w, sigmas)
         if step % _EVERY == _EVERY - 1:
             self._update(step)
 
     def _update(self, step: int) -> None:
-        seen = self.recent_weight >= 0
-        self.visited |= seen
-        opacity = -torch.expm1(-self.recent_sigma * self.lengths)
-        self.opacity = torch.where(seen, torch.maximum(self.opacity * _DECAY, opacity), self.opacity)
-        self.weight = torch.where(seen, torch.maximum(self.weight * _DECAY, self.recent_weight), self.weight)
-        self.recent_weight.fill_(-1.0)
-        self.recent_sigma.zero_()
-        cells = self._cells_to_probe(step)
-        self.opacity[cells] = torch.maximum(self.opacity[cells] * _DECAY, self._probe(cells))
-        keep = self.opacity > min(_OPACITY, float(self.opacity.mean()))
+        part = _PROBED_AT_FIRST if step < 4 * _EVERY else _PROBED
+        cells = self.open[torch.randint(len(self.open), (len(self.open) // part,), device=self.open.device)]
+        self.state[cells, 0] = torch.maximum(self.state[cells, 0] * _DECAY, self._probe(cells))
         if step >= self.cull_from:
             # a few hidden cells get another chance, since geometry still changes
-            again = torch.rand(len(self.weight)) < 0.01
-            self.weight[again] = self.weight[again].clamp_min(4 * _WEIGHT)
-            keep &= self.weight > _WEIGHT
-        if step >= 4 * self.cull_from:
-            keep &= self.visited
-        self._set(keep)
-
-    def _cells_to_probe(self, step: int) -> Tensor:
-        n = len(self.opacity)
-        return torch.randint(n, (n // 8 if step < 4 * _EVERY else n // 32,))
+            again = self.open[torch.randint(len(self.open), (len(self.open) // 100,), device=self.open.device)]
+            self.state[again, 1] = self.state[again, 1].clamp_min(4 * _WEIGHT)
+        self._set(_WEIGHT if step >= self.cull_from else -1.0, step >= 4 * self.cull_from)
 
     def _probe(self, cells: Tensor) -> Tensor:
         with torch.no_grad():
             parts = [self.model.density(self.model.sampler.points_in(c)) for c in cells.split(1 << 16)]
-        return -torch.expm1(-torch.cat(parts) * self.lengths[cells])
+        return -torch.expm1(-torch.cat(parts) * self.state[cells, 2])
 
-    def _set(self, keep: Tensor) -> None:
-        keep = keep & self.allowed
-        self.model.looking_where(keep.to(torch.uint8).reshape(self.model.sampler.grid.shape))
+    def _set(self, weight: float, only_seen: bool) -> None:
+        """Show cells that are opaque enough and have a weight above ``weight``."""
+        opacity = min(_OPACITY, float(self.state[:, 0].mean()))
+        grid = kernels.keep(self.state, self.allowed, opacity, weight, only_seen)
+        self.model.looking_where(grid.reshape(self.model.sampler.grid.shape))
 
     def settle(self, pixels: PixelBank, rays: int = 200_000) -> None:
         """The final grid: every opaque cell that some training ray sees. Leaves the model in training mode.
 
         Where no ray ever went the density is whatever the networks make of it: haze before a new camera.
         """
-        everything = torch.arange(len(self.opacity))
-        opaque = self.opacity > _OPACITY / 4
+        opaque = (self.state[:, 0] > _OPACITY / 4).nonzero()[:, 0]
         for _ in range(2):
-            for cells in everything[opaque].split(1 << 18):
-                self.opacity[cells] = torch.maximum(self.opacity[cells], self._probe(cells))
-        keep = self.opacity > min(_OPACITY, float(self.opacity.mean()))
-        self._set(keep)
-        seen = torch.zeros_like(self.weight)
-        chosen = torch.randperm(len(pixels))[:rays]
-        with torch.no_grad():
-            for part in chosen.split(CHUNK):
-                r = pixels.rays(part)
+            for cells in opaque.split(1 << 18):
+                self.state[cells, 0] = torch.maximum(self.state[cells, 0], self._probe(cells))
+        self._set(-1.0, False)
+        self.state[:, 1] = torch.where(self.state[:, 3] >= 0, self.state[:, 1], 0)
+        for chosen in torch.randperm(len(pixels))[:rays].split(CHUNK):
+            r = pixels.rays(chosen)
+            with torch.no_grad():
                 samples = self.model.samples(r, jitter=True)
                 x, _ = samples.positions(r)
-                kernels.scatter_max(weights(self.model.density(x), samples), self.model.sampler.cells(x), seen)
-        seen = torch.maximum(seen, torch.where(self.visited, self.weight, 0))
-        self._set(keep & (seen > _WEIGHT / 2))
+                w = weights(self.model.density(x), samples)
+            kernels.scatter_max(w, self.model.sampler.cells(x), self.state[:, 1])
+        self._set(_WEIGHT / 2, False)

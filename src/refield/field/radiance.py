@@ -15,7 +15,8 @@ from torch.nn import functional
 
 from refield.field import kernels
 from refield.field.encoding import Contraction, HashGrid, geometric_levels
-from refield.field.kernels.reference import DensityNet
+from refield.field.kernels.reference import DensityNet, Networks, truncated_exp
+from refield.field.networks import weight
 from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
@@ -75,11 +76,11 @@ class HashField(nn.Module):
         levels = geometric_levels(config.coarsest, config.finest, config.levels)
         self.encoding = HashGrid(levels, 1 << config.log2_table, g)
         w, k = config.width, config.geometry_features
-        self.density_in = _weight(w, self.encoding.width, g)
-        self.density_out = _weight(1 + k, w, g)
-        self.colour_in = _weight(w, k + 16, g)
-        self.colour_mid = _weight(w, w, g)
-        self.colour_out = _weight(3, w, g)
+        self.density_in = weight(w, self.encoding.width, g)
+        self.density_out = weight(1 + k, w, g)
+        self.colour_in = weight(w, k + 16, g)
+        self.colour_mid = weight(w, w, g)
+        self.colour_out = weight(3, w, g)
 
     @property
     def contraction(self) -> Contraction:
@@ -88,34 +89,41 @@ class HashField(nn.Module):
     def density(self, x: Tensor) -> Tensor:
         """World points (..., 3) -> sigma (...,), per world unit."""
         flat = x.reshape(-1, 3)
-        sigma = self._sigma(functional.linear(self._hidden(flat), self.density_out[:1])[:, 0])
-        return self._where_seen(sigma, flat).reshape(x.shape[:-1])
+        if torch.is_grad_enabled() and (flat.requires_grad or self.density_in.requires_grad):
+            raw = functional.linear(self._hidden(flat), self.density_out[:1])[:, 0]
+        else:
+            raw = kernels.hash_density(self._unit(flat), self.density_net)
+        return self._where_seen(self._sigma(raw), flat).reshape(x.shape[:-1])
 
     def forward(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """World points (..., 3), unit directions (..., 3) -> sigma (...,), rgb (..., 3) in [0, 1]."""
         flat = x.reshape(-1, 3)
-        out = functional.linear(self._hidden(flat), self.density_out)
-        features = torch.cat([out[:, 1:], kernels.spherical_harmonics(d.reshape(-1, 3))], -1)
-        hidden = functional.relu(functional.linear(features, self.colour_in))
-        hidden = functional.relu(functional.linear(hidden, self.colour_mid))
-        rgb = torch.sigmoid(functional.linear(hidden, self.colour_out))
-        sigma = self._where_seen(self._sigma(out[:, 0]), flat)
-        return sigma.reshape(x.shape[:-1]), rgb.reshape(x.shape)
+        enc = self.encoding
+        raw, rgb = kernels.hash_field(self._unit(flat), d.reshape(-1, 3), enc.tables, enc.resolutions, self.networks)
+        return self._where_seen(self._sigma(raw), flat).reshape(x.shape[:-1]), rgb.reshape(x.shape)
 
     def samples(self, rays: Rays, jitter: bool = False) -> Samples:
         """Where to evaluate the field along rays: the sampler's places, ended behind the first opaque surface."""
         return self.sampler.visible(rays, self.density_net, jitter)
 
     @property
+    def networks(self) -> Networks:
+        """The density network's two matrices and the colour network's three."""
+        return self.density_in, self.density_out, self.colour_in, self.colour_mid, self.colour_out
+
+    @property
     def density_net(self) -> DensityNet:
         """What marching needs to know the density: tables, their resolutions, and the network's two layers."""
         return self.encoding.tables, self.encoding.resolutions, self.density_in, self.density_out[0]
+
+    def _unit(self, flat: Tensor) -> Tensor:
+        return (self.contraction(flat) + 2) / 4
 
     def _hidden(self, flat: Tensor) -> Tensor:
         return functional.relu(functional.linear(self.encoding(self.contraction(flat)), self.density_in))
 
     def _sigma(self, raw: Tensor) -> Tensor:
-        return _truncated_exp(raw) / self.contraction.radius
+        return truncated_exp(raw) / self.contraction.radius
 
     def _where_seen(self, sigma: Tensor, x: Tensor) -> Tensor:
         if self.training:
@@ -165,28 +173,3 @@ class HashField(nn.Module):
     def looking_where(self, grid: Tensor) -> None:
         """Replace the occupancy grid (R, R, R) uint8."""
         self.sampler = replace(self.sampler, grid=grid)
-
-
-def _weight(rows: int, columns: int, generator: torch.Generator) -> nn.Parameter:
-    """He-uniform, no bias."""
-    bound = (6 / columns) ** 0.5
-    return nn.Parameter((torch.rand(rows, columns, generator=generator) * 2 - 1) * bound)
-
-
-class _TruncatedExp(torch.autograd.Function):
-    """exp whose gradient does not run away (Instant-NGP)."""
-
-    @staticmethod
-    def forward(ctx, x: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
-        out = torch.exp(x.clamp(max=15))
-        ctx.save_for_backward(out)
-        return out
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
-        (out,) = ctx.saved_tensors
-        return grad * out.clamp(max=3e4)
-
-
-def _truncated_exp(x: Tensor) -> Tensor:
-    return _TruncatedExp.apply(x)

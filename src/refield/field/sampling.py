@@ -14,6 +14,8 @@ from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
 
+STOP = 7.0  # optical depth at which a ray ends: e^-7 is a thousandth
+
 
 @dataclass(frozen=True)
 class OccupancySampler:
@@ -38,17 +40,21 @@ class OccupancySampler:
         with torch.no_grad():
             return Samples(*kernels.march(*self._question(rays, jitter)))
 
-    def visible(self, rays: Rays, net: DensityNet, jitter: bool = False, stop: float = 7.0) -> Samples:
-        """As a call, but nothing behind the sample where the optical depth passes ``stop`` (e^-7 is a thousandth)."""
+    def visible(self, rays: Rays, net: DensityNet, jitter: bool = False, stop: float = STOP) -> Samples:
+        """As a call, but nothing behind the sample where the optical depth passes ``stop``."""
         with torch.no_grad():
             return Samples(*kernels.march_visible(*self._question(rays, jitter), net, stop))
 
     def _question(self, rays: Rays, jitter: bool) -> tuple[Rays3, Space, Tensor, Lattice]:
         n = len(rays)
         shift = torch.rand(n, device=rays.origins.device) if jitter else rays.origins.new_zeros(n)
-        lattice = (self.near, self.far * self.contraction.radius, self.step)
         space = (self.contraction.centre, self.contraction.radius)
-        return (rays.origins, rays.directions, shift), space, self.grid, lattice
+        return (rays.origins, rays.directions, shift), space, self.grid, self.lattice
+
+    @property
+    def lattice(self) -> Lattice:
+        """near, far and step, world units."""
+        return self.near, self.far * self.contraction.radius, self.step
 
     def cells(self, x: Tensor) -> Tensor:
         """Flat index of the grid cell that holds each world point, (..., 3) -> (...,) int64."""

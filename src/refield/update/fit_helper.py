@@ -21,7 +21,6 @@ from refield.update.frozen import Segments, Woven, weave
 from refield.update.helper import HelperOccupancy, emptiness
 from refield.update.supervision import Lessons
 
-_BAD_STEPS = 20
 _CHUNK = 16384  # rays
 
 
@@ -54,8 +53,8 @@ class HelperTraining:
         self.sparse, self.old, self.judge = sparse, old, judge
         self.empty = emptiness(frozen.change, helper.sampler, frozen.bare)
         self.occupancy = HelperOccupancy(helper)
-        self.adam = TableAdam(helper, config.rate)
-        self.rays_per_step, self.bad, self.steps_done = 1024, 0, 0
+        self.adam = TableAdam(helper)
+        self.rays_per_step, self.steps_done = 1024, 0
         self.why_stopped = "all steps done"
 
     def run(self, on_progress: Callable[[UpdateProgress], None] | None = None) -> list[float]:
@@ -71,7 +70,11 @@ class HelperTraining:
                 self.why_stopped = "out of time"
                 break
             self.helper.train()
-            self._step(step, c.rate * rate_factor(progress))
+            try:
+                self._step(step, c.rate * rate_factor(progress))
+            except NonFiniteError as error:
+                self.why_stopped = str(error)
+                break
             self.steps_done = step + 1
             if (step + 1) % c.check_every == 0:
                 looks.append(self.psnr(self.judge))
@@ -146,21 +149,11 @@ class HelperTraining:
         own = w[woven.own]
         cells = self.helper.sampler.cells(x)
         loss = loss + self.config.emptiness * (own * self.empty[cells]).sum() / len(rays)
-        self._descend(loss, rate)
-        self.occupancy.observe(step, x, own.detach(), sigmas.detach())
+        self.adam.backward(loss)
+        self.adam.step(rate, float(loss.detach()))
+        self.occupancy.observe(step, cells, own.detach(), sigmas.detach())
         per_ray = max(len(x) / len(rays), 0.5)
         self.rays_per_step = int(min(max(self.config.samples / per_ray, 1024), 8192))
-
-    def _descend(self, loss: Tensor, rate: float) -> None:
-        if not math.isfinite(loss.item()):
-            self.bad += 1
-            if self.bad >= _BAD_STEPS:
-                raise NonFiniteError(f"the update's loss was not finite for {_BAD_STEPS} steps in a row")
-            return
-        self.bad = 0
-        self.adam.zero_grad()
-        loss.backward()
-        self.adam.step(rate)
 
 
 def _joined(parts: list[Segments]) -> Segments:

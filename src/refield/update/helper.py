@@ -70,12 +70,11 @@ class HelperOccupancy:
     def __init__(self, helper: HashField, cull_from: int = 64) -> None:
         self.helper = helper
         self.allowed = helper.sampler.grid.clone()
-        self.trainer = OccupancyTrainer(helper, cull_from)
+        self.trainer = OccupancyTrainer(helper, cull_from, self.allowed.reshape(-1) > 0, doubt=0.0)
 
-    def observe(self, step: int, x: Tensor, w: Tensor, sigmas: Tensor) -> None:
-        """After each step: samples' positions (S, 3), weights (S,) and densities (S,)."""
-        self.trainer.observe(step, x, w, sigmas)
-        self.helper.looking_where(self.helper.sampler.grid & self.allowed)
+    def observe(self, step: int, cells: Tensor, w: Tensor, sigmas: Tensor) -> None:
+        """After each step: samples' cells (S,), weights (S,) and densities (S,)."""
+        self.trainer.observe(step, cells, w, sigmas)
 
     def settle(self) -> None:
         """The grid to show: opaque cells next to what training rays saw. Few photos see little of a surface; a view

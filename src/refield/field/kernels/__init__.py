@@ -1,4 +1,5 @@
-"""The hot loops of the engine; every one has a plain-torch truth in `reference` and a numba twin in `cpu`.
+"""The hot loops of the engine; every one has a plain-torch truth in `reference`, and twins in `cpu` (numba) and
+`gpu` (Triton).
 
 The twin is chosen by the device of the tensors. Set ``REFIELD_KERNELS=reference`` to run the truth everywhere.
 """
@@ -11,12 +12,16 @@ from types import ModuleType
 from torch import Tensor
 
 from refield.field.kernels import reference
-from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
+from refield.field.kernels.reference import Aim, Batch, DensityNet, Lattice, Networks, Rays3, Space, Stepped
 
 
 def _twin(t: Tensor) -> ModuleType:
-    if t.device.type != "cpu" or os.environ.get("REFIELD_KERNELS") == "reference":
+    if t.device.type not in ("cpu", "cuda") or os.environ.get("REFIELD_KERNELS") == "reference":
         return reference
+    if t.device.type == "cuda":
+        from refield.field.kernels import gpu
+
+        return gpu
     from refield.field.kernels import cpu
 
     return cpu
@@ -35,6 +40,18 @@ def hash_encode(unit: Tensor, tables: Tensor, resolutions: tuple[int, ...]) -> T
 def spherical_harmonics(d: Tensor) -> Tensor:
     """See `reference.spherical_harmonics`."""
     return _twin(d).spherical_harmonics(d)
+
+
+def hash_field(
+    unit: Tensor, d: Tensor, tables: Tensor, resolutions: tuple[int, ...], networks: Networks
+) -> tuple[Tensor, Tensor]:
+    """See `reference.hash_field`."""
+    return _twin(unit).hash_field(unit, d, tables, resolutions, networks)
+
+
+def hash_density(unit: Tensor, net: DensityNet) -> Tensor:
+    """See `reference.hash_density`."""
+    return _twin(unit).hash_density(unit, net)
 
 
 def weights(sigmas: Tensor, t_starts: Tensor, t_ends: Tensor, offsets: Tensor) -> Tensor:
@@ -72,3 +89,26 @@ def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float
 def scatter_max(values: Tensor, cells: Tensor, into: Tensor) -> None:
     """See `reference.scatter_max`."""
     _twin(into).scatter_max(values, cells, into)
+
+
+def train_step(
+    batch: Batch,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    aim: Aim,
+    into: list[Tensor],
+) -> Stepped:
+    """See `reference.train_step`."""
+    return _twin(grid).train_step(batch, space, grid, lattice, field, aim, into)
+
+
+def observe(state: Tensor, now: int, decay: float, cells: Tensor, w: Tensor, sigmas: Tensor) -> None:
+    """See `reference.observe`."""
+    _twin(state).observe(state, now, decay, cells, w, sigmas)
+
+
+def keep(state: Tensor, allowed: Tensor, opacity: float, weight: float, only_seen: bool) -> Tensor:
+    """See `reference.keep`."""
+    return _twin(state).keep(state, allowed, opacity, weight, only_seen)

@@ -7,6 +7,7 @@ Every function here is differentiable by autograd where its twin is.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,6 +20,44 @@ Lattice = tuple[float, float, float]
 """near, far, step in world units"""
 DensityNet = tuple[Tensor, tuple[int, ...], Tensor, Tensor]
 """hash tables (L, T, F), their resolutions, hidden weights (H, L * F), output weights (H,)"""
+
+Networks = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""density in (H, L * F), density out (1 + K, H), colour in (H, K + 16), colour mid (H, H), colour out (3, H)"""
+
+
+class Batch(NamedTuple):
+    """What a training step looks at."""
+
+    rays: Rays3
+    colours: Tensor
+    """(N, 3) of the photos"""
+    background: Tensor
+    """(N, 3) shown where a ray stays transparent"""
+
+
+class Aim(NamedTuple):
+    """What a training step wants."""
+
+    distortion: float
+    """weight of the distortion loss"""
+    gradient_unit: float
+    """gradients of samples nearer than this, world units, are scaled down by the square of their distance (§10.1)"""
+    stop: float
+    """optical depth at which a ray ends"""
+
+
+class Stepped(NamedTuple):
+    """What a training step found."""
+
+    loss: float
+    cells: Tensor
+    """(S,) int64, flat index of the grid cell of each sample"""
+    weights: Tensor
+    """(S,)"""
+    sigmas: Tensor
+    """(S,) per world unit"""
+    rays: int
+
 
 PRIMES = (1, 2654435761, 805459861)  # the spatial hash of Teschner et al. 2003, as in Instant-NGP, Eq. 4
 
@@ -87,6 +126,30 @@ def spherical_harmonics(d: Tensor) -> Tensor:
         ],
         -1,
     )
+
+
+def hash_field(
+    unit: Tensor, d: Tensor, tables: Tensor, resolutions: tuple[int, ...], networks: Networks
+) -> tuple[Tensor, Tensor]:
+    """Encoding and both networks: unit (S, 3) in [0, 1], directions (S, 3) -> raw density (S,), rgb (S, 3)."""
+    return through_networks(hash_encode(unit, tables, resolutions), spherical_harmonics(d), networks)
+
+
+def through_networks(features: Tensor, harmonics: Tensor, networks: Networks) -> tuple[Tensor, Tensor]:
+    """Features (S, L * F) and harmonics (S, 16) -> raw density (S,), rgb (S, 3) in [0, 1]."""
+    density_in, density_out, colour_in, colour_mid, colour_out = networks
+    out = (features @ density_in.T).relu() @ density_out.T
+    entering = torch.cat([out[:, 1:], harmonics], -1)
+    hidden = (entering @ colour_in.T).relu()
+    hidden = (hidden @ colour_mid.T).relu()
+    return out[:, 0], torch.sigmoid(hidden @ colour_out.T)
+
+
+def hash_density(unit: Tensor, net: DensityNet) -> Tensor:
+    """The raw density alone, without gradients: unit (S, 3) in [0, 1] -> (S,)."""
+    tables, resolutions, w_in, w_out = net
+    with torch.no_grad():
+        return (hash_encode(unit, tables, resolutions) @ w_in.T).relu() @ w_out
 
 
 def _ray_ids(offsets: Tensor) -> Tensor:
@@ -163,26 +226,120 @@ def march_visible(
     """
     origins, directions, _ = rays
     t0, t1, offsets = march(rays, space, grid, lattice)
-    tables, resolutions, w_in, w_out = net
     ids = _ray_ids(offsets)
     x = origins[ids] + directions[ids] * ((t0 + t1) / 2)[:, None]
-    features = hash_encode((contract(x, *space) + 2) / 4, tables, resolutions)
-    sigma = torch.exp(((features @ w_in.T).relu() @ w_out).clamp(max=15)) / space[1]
+    sigma = torch.exp(hash_density((contract(x, *space) + 2) / 4, net).clamp(max=15)) / space[1]
     keep = _exclusive_sum(sigma * (t1 - t0), offsets) < stop
     counts = torch.zeros(len(offsets) - 1, dtype=torch.long, device=ids.device).index_add(0, ids, keep.long())
     return t0[keep], t1[keep], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
 
 
 def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, step: int) -> None:
-    """One Adam step in place on a hash table (L, T, F); rows without gradient are left alone (as Instant-NGP does)."""
+    """One Adam step in place on any parameter; what has no gradient is left alone (as Instant-NGP does).
+
+    ``grad`` is cleared for the next step.
+    """
     b1, b2 = 0.9, 0.99
     scale = rate * math.sqrt(1 - b2**step) / (1 - b1**step)
     touched = grad != 0
     first.copy_(torch.where(touched, first * b1 + grad * (1 - b1), first))
     second.copy_(torch.where(touched, second * b2 + grad * grad * (1 - b2), second))
     param.sub_(torch.where(touched, scale * first / (second.sqrt() + 1e-15), torch.zeros_like(param)))
+    grad.zero_()
 
 
 def scatter_max(values: Tensor, cells: Tensor, into: Tensor) -> None:
     """``into[cells] = max(into[cells], values)`` in place; into (K,), cells (S,) int64."""
     into.scatter_reduce_(0, cells, values, "amax")
+
+
+def observe(state: Tensor, now: int, decay: float, cells: Tensor, w: Tensor, sigmas: Tensor) -> None:
+    """Note in ``state`` what samples found in their cells (S,) int64: weights (S,), densities (S,).
+
+    state (K, 4): running maxima of a sample's opacity and of its weight, which decay once in each round in which the
+    cell is seen; the length of a sample; the last such round, or below 0. ``now`` is this round.
+    """
+    seen = cells.unique()
+    fresh = seen[state[seen, 3] != now]
+    state[fresh, :2] *= decay
+    state[fresh, 3] = now
+    for column, values in ((0, 1 - torch.exp(-sigmas * state[cells, 2])), (1, w)):
+        state[:, column] = state[:, column].scatter_reduce(0, cells, values, "amax")
+
+
+def keep(state: Tensor, allowed: Tensor, opacity: float, weight: float, only_seen: bool) -> Tensor:
+    """(K,) uint8: ``allowed`` (K,) bool cells above both bounds, and ``only_seen`` ones if wanted."""
+    kept = allowed & (state[:, 0] > opacity) & (state[:, 1] > weight)
+    return (kept & (state[:, 3] >= 0) if only_seen else kept).to(torch.uint8)
+
+
+class _TruncatedExp(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
+        out = torch.exp(x.clamp(max=15))
+        ctx.save_for_backward(out)
+        return out
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
+        (out,) = ctx.saved_tensors
+        return grad * out.clamp(max=3e4)
+
+
+def truncated_exp(x: Tensor) -> Tensor:
+    """exp(min(x, 15)) whose gradient neither runs away nor ends: what is too dense can come back (Instant-NGP)."""
+    return _TruncatedExp.apply(x)
+
+
+class _ScaleGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, scale: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
+        ctx.save_for_backward(scale)
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[no-untyped-def]
+        (scale,) = ctx.saved_tensors
+        return grad * (scale if grad.dim() == 1 else scale[:, None]), None
+
+
+def scale_gradient(x: Tensor, scale: Tensor) -> Tensor:
+    """x (S,) or (S, C) itself; its gradient times scale (S,)."""
+    return _ScaleGradient.apply(x, scale)
+
+
+def train_step(
+    batch: Batch,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    aim: Aim,
+    into: list[Tensor],
+) -> Stepped:
+    """March, evaluate, composite, compare and go back: adds d loss / d parameter to ``into`` (tables, five matrices).
+
+    loss = mean squared colour error (Eq. 2) + aim.distortion * mean distortion, distances in s = t / (t + radius).
+    """
+    tables, resolutions, networks = field
+    origins, directions, _ = batch.rays
+    net = (tables.detach(), resolutions, networks[0].detach(), networks[1][0].detach())
+    t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop)
+    ids, mid = _ray_ids(offsets), (t0 + t1) / 2
+    unit = (contract(origins[ids] + directions[ids] * mid[:, None], *space) + 2) / 4
+    leaves = [p.detach().requires_grad_() for p in (tables, *networks)]
+    with torch.enable_grad():
+        raw, rgbs = hash_field(unit, directions[ids], leaves[0], resolutions, tuple(leaves[1:]))  # type: ignore[arg-type]
+        sigmas = truncated_exp(raw) / space[1]
+        near = (mid / aim.gradient_unit).square().clamp(max=1)
+        w = weights(scale_gradient(sigmas, near), t0, t1, offsets)
+        shown = accumulate(w, torch.cat([scale_gradient(rgbs, near), torch.ones_like(w)[:, None]], -1), offsets)
+        rgb = shown[:, :3] + (1 - shown[:, 3:]) * batch.background
+        s0, s1 = (t / (t + space[1]) for t in (t0, t1))
+        loss = (rgb - batch.colours).square().mean() + aim.distortion * distortion(w, s0, s1, offsets).mean()
+    for total, grad in zip(into, torch.autograd.grad(loss, leaves)):
+        total += grad
+    r = grid.shape[0]
+    ijk = (unit * r).long().clamp_(0, r - 1)
+    cells = (ijk[:, 0] * r + ijk[:, 1]) * r + ijk[:, 2]
+    return Stepped(float(loss.detach()), cells, w.detach(), sigmas.detach(), len(offsets) - 1)

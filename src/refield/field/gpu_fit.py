@@ -1,0 +1,186 @@
+"""The training loop on a GPU: replays of a captured step, and between them what a graph cannot hold."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import torch
+
+from refield.field.coverage import knowable
+from refield.field.encoding import Contraction
+from refield.field.fit import (
+    COARSEST,
+    MOST_SKIPPED,
+    FitConfig,
+    FitProgress,
+    HeldOut,
+    NonFiniteError,
+    ProgressCallback,
+    rate_factor,
+)
+from refield.field.graphed import Descent, DevicePixels, GraphedStep
+from refield.field.kernels.reference import Aim
+from refield.field.occupancy import _DECAY, _EVERY, OccupancyTrainer
+from refield.field.pixels import PixelBank
+from refield.field.radiance import HashField
+from refield.field.sampling import STOP
+from refield.scene.capture import Capture, Rays
+
+_BATCH = 32  # times the samples of a step on a CPU: fewer would leave most of the chip idle
+# two sizes an octave: a step's room for samples is at least half full, and few graphs are captured
+_SIZES = sorted([1 << k for k in range(9, 18)] + [3 << k for k in range(8, 16)])
+_ROOM = 0.95  # of the samples' room is aimed at; what overflows is left out
+
+
+def fit_on_gpu(
+    model: HashField, capture: Capture, config: FitConfig, on_progress: ProgressCallback | None = None
+) -> None:
+    """Fit a field to the capture's training frames on the current CUDA device; the model comes back to where it was.
+
+    As many steps as on a CPU, each of 32 times the samples.
+
+    Raises:
+        NonFiniteError: the loss or its gradient was not finite for 20 steps in a row.
+    """
+    home, device = model.encoding.tables.device, torch.device("cuda", torch.cuda.current_device())
+    allowed = knowable(model.sampler, capture.train)
+    move(model, device)
+    try:
+        with torch.device(device):  # what is made in here without a device named is made on the GPU
+            _GpuFit(model, capture, config, (allowed.to(device), on_progress)).run()
+    finally:
+        move(model, home)
+
+
+def move(model: HashField, device: torch.device) -> None:
+    """The field's parameters and its sampler to a device, in place."""
+    model.to(device)
+    space = model.sampler.contraction
+    grid, centre = model.sampler.grid.to(device), space.centre.to(device)
+    model.sampler = replace(model.sampler, contraction=Contraction(centre, space.radius), grid=grid)
+
+
+class _GpuFit:
+    """The state of one run of :func:`fit_on_gpu`."""
+
+    def __init__(
+        self,
+        model: HashField,
+        capture: Capture,
+        config: FitConfig,
+        extra: tuple[torch.Tensor, ProgressCallback | None],
+    ) -> None:
+        allowed, self.on_progress = extra
+        self.model, self.config = model, config
+        device = model.encoding.tables.device
+        with torch.device("cpu"):  # photos are read and posed there
+            self.pixels = DevicePixels(PixelBank(capture.train), device)
+            self.judge = HeldOut(capture.held_out)
+        if self.judge.rays is not None:
+            r = self.judge.rays
+            self.judge.rays = Rays(r.origins.to(device), r.directions.to(device))
+            self.judge.truth = self.judge.truth.to(device)
+        self.occupancy = OccupancyTrainer(model, allowed=allowed)
+        model.looking_where(allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
+        self.grid = model.sampler.grid.clone()  # the one that graphs read
+        self.descent = Descent(model)
+        self.capacity = config.samples * _BATCH
+        self.rays_per_step, self.coarseness = _SIZES[0], COARSEST
+        self.finest_step = model.sampler.step
+        self.began, self.rays_done = time.perf_counter(), 0
+
+    def run(self) -> None:
+        self.model.train()
+        try:
+            samples = self._steps()
+        except NonFiniteError:
+            self.occupancy.settle(self.pixels)  # type: ignore[arg-type]
+            raise
+        self.occupancy.settle(self.pixels)  # type: ignore[arg-type]
+        self._look(self.config.steps, samples / self.rays_per_step)
+
+    def _steps(self) -> int:
+        """All rounds of steps, each followed by what a graph cannot hold; returns the samples of the last step."""
+        looks: list[float] = []
+        due = self.config.check_every
+        graph, step = self._captured(0)
+        while self._progress(step) < 1:
+            step = self._round(graph, step)
+            samples = int(graph.samples)
+            if int(self.descent.bad) >= MOST_SKIPPED:
+                raise NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
+            if step >= due:
+                due += self.config.check_every
+                looks.append(self._look(step, samples / self.rays_per_step))
+                if self._plateau(looks):
+                    break
+            if self._resized(samples):
+                graph, step = self._captured(step)
+        return int(graph.samples)
+
+    def _round(self, graph: GraphedStep, step: int) -> int:
+        """Steps up to the next update of the occupancy grid, and that."""
+        graph.now.fill_(1 + step // _EVERY)
+        for _ in range(_EVERY - step % _EVERY):
+            self._set_rate(step)
+            graph.replay()
+            step += 1
+            self.rays_done += self.rays_per_step
+        self.occupancy._update(step - 1)
+        self.grid.copy_(self.model.sampler.grid)
+        return step
+
+    def _captured(self, step: int) -> tuple[GraphedStep, int]:
+        """The step for the present number of rays and lattice, captured; and the count of steps after its warm-up."""
+        sampler = replace(self.model.sampler, step=self.finest_step * self.coarseness)
+        self.model.sampler = sampler
+        space = (sampler.contraction.centre, sampler.contraction.radius)
+        aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
+        where = (space, self.grid, sampler.lattice, self.model.encoding.resolutions)
+        occupancy = (self.occupancy.state, _DECAY)
+        graph = GraphedStep(self.descent, self.pixels, where, aim, occupancy, (self.rays_per_step, self.capacity))
+        graph.now.fill_(1 + step // _EVERY)
+        self._set_rate(step)
+        return graph, step + graph.capture()
+
+    def _set_rate(self, step: int) -> None:
+        self.descent.rate.fill_(self.config.rate * rate_factor(self._progress(step)))
+
+    def _resized(self, samples: int) -> bool:
+        """Choose the rays of a step and the lattice anew, after a step with so many samples; whether either changed."""
+        rays, coarseness = self.rays_per_step, self.coarseness
+        per_ray, overfull = samples / rays, samples >= self.capacity
+        if per_ray > self.config.samples_per_ray:
+            self.coarseness = COARSEST
+        elif per_ray < 0.75 * self.config.samples_per_ray / COARSEST:
+            self.coarseness = 1.0
+        per_ray *= coarseness / self.coarseness * (2 if overfull else 1)  # how many more there would be is not known
+        fits = [n for n in _SIZES if n * per_ray <= _ROOM * self.capacity]
+        wanted = fits[-1] if fits else _SIZES[0]
+        # half an octave more is not worth a capture while this one is well filled; less is needed at once
+        if overfull or wanted < rays or wanted > 1.4 * rays or self.coarseness != coarseness:
+            self.rays_per_step = wanted
+        return (self.rays_per_step, self.coarseness) != (rays, coarseness)
+
+    def _progress(self, step: int) -> float:
+        by_time = 0.0
+        if self.config.max_seconds:
+            by_time = (time.perf_counter() - self.began) / self.config.max_seconds
+        return max(step / self.config.steps, by_time)
+
+    def _look(self, step: int, samples_per_ray: float) -> float:
+        psnr = self.judge.psnr(self.model)
+        self.model.train()
+        if self.on_progress:
+            seconds = time.perf_counter() - self.began
+            left = max(seconds * (1 / max(self._progress(step), 1e-6) - 1), 0.0)
+            speed = self.rays_done / seconds
+            self.on_progress(FitProgress(step, self.config.steps, psnr, speed, samples_per_ray, seconds, left))
+        return psnr
+
+    def _plateau(self, looks: list[float]) -> bool:
+        n = self.config.patience
+        worth = [x for x in looks if not math.isnan(x)]
+        return len(worth) > n and max(worth[-n:]) < max(worth[:-n]) + self.config.least_gain

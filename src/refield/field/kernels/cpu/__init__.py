@@ -1,0 +1,30 @@
+"""The hot loops for the CPU, by numba: the same functions as `reference`, value for value and gradient for gradient.
+
+Loops over samples or rays run in parallel; scatters run in parallel over levels, so nothing is atomic, and partial
+sums are over a fixed number of groups: results are the same, bit for bit, for every thread count.
+"""
+
+from refield.field.kernels.cpu.encoding import hash_encode
+from refield.field.kernels.cpu.marching import hash_density, march, march_visible
+from refield.field.kernels.cpu.networks import hash_field
+from refield.field.kernels.cpu.optimiser import adam, keep, observe, scatter_max
+from refield.field.kernels.cpu.rays import accumulate, contract, distortion, spherical_harmonics, weights
+from refield.field.kernels.cpu.step import train_step
+
+__all__ = [
+    "accumulate",
+    "adam",
+    "contract",
+    "distortion",
+    "hash_density",
+    "hash_encode",
+    "hash_field",
+    "keep",
+    "march",
+    "march_visible",
+    "observe",
+    "scatter_max",
+    "spherical_harmonics",
+    "train_step",
+    "weights",
+]

@@ -1,0 +1,166 @@
+"""A whole training step on the CPU: what is computed for some rays is used while it is still in the cache.
+
+March (with the encoding) → for each group of rays: networks, compositing, loss and back again → scatter into tables.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from refield.field.kernels.cpu.encoding import array, encode_backward, pairs
+from refield.field.kernels.cpu.marching import Marched, marched
+from refield.field.kernels.cpu.networks import (
+    BLOCK,
+    backward_block,
+    forward_block,
+    group_sums,
+    pack,
+    room_for,
+    sizes_of,
+    unpack,
+)
+from refield.field.kernels.cpu.simd import JIT, exp
+from refield.field.kernels.reference import Aim, Batch, Lattice, Networks, Space, Stepped
+
+_ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
+
+
+@njit(inline="never", **JIT)
+def _prepare(first, n, raw, t0, t1, radius, unit, sigma, scratch):  # type: ignore[no-untyped-def]
+    """What each sample of a block needs, in straight loops: its density, and five numbers into ``scratch`` (5, n)."""
+    clear, mid, length, near, delta = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    for k in range(n):
+        a, b = t0[first + k], t1[first + k]
+        delta[k] = b - a
+        s0, s1 = a / (a + radius), b / (b + radius)
+        mid[k], length[k] = (s0 + s1) / _TWO, s1 - s0
+        close = min((a + b) / (_TWO * unit), _ONE)
+        near[k] = close * close
+        density = exp(min(raw[k], np.float32(15))) / radius
+        sigma[first + k] = density
+        clear[k] = exp(-density * (b - a))
+
+
+@njit(inline="never", **JIT)
+def _along_ray(first, n, at, rgb, scratch, aim, told, w, sigma, to_raw, to_rgb):  # type: ignore[no-untyped-def]
+    """Composite a ray's n samples, compare, and write the gradients of the loss; returns the ray's share of the loss.
+
+    ``rgb``, ``scratch``, ``to_raw`` and ``to_rgb`` are the block's, in which the ray begins at ``at``; w and sigma are
+    the step's, in which it begins at ``first``.
+    """
+    radius, strength, _, rays = aim
+    truth, background = told
+    passes, mids, lengths, nears, deltas = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    red = green = blue = mass = moment = _ZERO
+    clear = _ONE
+    for i in range(n):
+        j, k = first + i, at + i
+        w[j] = clear * (_ONE - passes[k])
+        clear *= passes[k]
+        red, green, blue = red + w[j] * rgb[k, 0], green + w[j] * rgb[k, 1], blue + w[j] * rgb[k, 2]
+        mass, moment = mass + w[j], moment + w[j] * mids[k]
+    empty = _ONE - mass
+    d0 = red + empty * background[0] - truth[0]
+    d1 = green + empty * background[1] - truth[1]
+    d2 = blue + empty * background[2] - truth[2]
+    g = _TWO / (_THREE * rays)
+    g0, g1, g2 = g * d0, g * d1, g * d2
+    behind = g0 * background[0] + g1 * background[1] + g2 * background[2]
+    spread = before = moment_before = total = _ZERO
+    for i in range(n):  # to_raw holds dL / dw_i for now
+        j, k = first + i, at + i
+        mid, length = mids[k], lengths[k]
+        left = mid * before - moment_before
+        before, moment_before = before + w[j], moment_before + w[j] * mid
+        right = (moment - moment_before) - mid * (mass - before)
+        spread += _TWO * w[j] * left + w[j] * w[j] * length / _THREE
+        slope = _TWO * (left + right) + _TWO * w[j] * length / _THREE
+        to_raw[k] = g0 * rgb[k, 0] + g1 * rgb[k, 1] + g2 * rgb[k, 2] - behind + strength * slope / rays
+        total += w[j] * to_raw[k]
+        share = w[j] * nears[k]
+        to_rgb[k, 0], to_rgb[k, 1], to_rgb[k, 2] = g0 * share, g1 * share, g2 * share
+    clear = _ONE
+    for i in range(n):  # dL / dsigma_i = delta_i (T_{i+1} g_i - sum_{j>i} w_j g_j)
+        j, k = first + i, at + i
+        clear *= passes[k]
+        total -= w[j] * to_raw[k]
+        grown = min(sigma[j], np.float32(3e4) / radius)
+        to_raw[k] = deltas[k] * (clear * to_raw[k] - total) * nears[k] * grown
+    return (d0 * d0 + d1 * d1 + d2 * d2) / (_THREE * rays) + strength * spread / rays
+
+
+@njit(parallel=True, **JIT)
+def _through(found, batch, sizes, packed, aim, outs, all_sums, losses):  # type: ignore[no-untyped-def]
+    """Every group: its rays forward and back, some at a time; gradients of the networks into its own sums."""
+    t0, t1, _, _, features, offsets = found
+    directions, colours, background = batch
+    w, sigma, to_features = outs
+    groups, rays = len(losses), len(offsets) - 1
+    for g in prange(groups):
+        begin = np.searchsorted(offsets, len(t0) * g // groups)
+        end = rays if g == groups - 1 else np.searchsorted(offsets, len(t0) * (g + 1) // groups)
+        longest = BLOCK
+        for r in range(begin, end):
+            longest = max(longest, offsets[r + 1] - offsets[r])
+        room, back = room_for(longest, packed), room_for(longest, packed)
+        d, scratch = np.empty((longest, 3), np.float32), np.empty((5, longest), np.float32)
+        to_raw, to_rgb = np.empty(longest, np.float32), np.empty((longest, 3), np.float32)
+        sums = (all_sums[0][g], all_sums[1][g], all_sums[2][g], all_sums[3][g], all_sums[4][g])
+        loss = 0.0
+        last = int(begin)
+        while last < end:
+            r = last
+            first = offsets[r]
+            last += 1
+            while last < end and offsets[last + 1] - first <= longest:
+                last += 1
+            n = offsets[last] - first
+            for q in range(r, last):
+                for i in range(offsets[q] - first, offsets[q + 1] - first):
+                    d[i] = directions[q]
+            forward_block(features[first : first + n], d[:n], sizes, packed, room)
+            _prepare(first, n, room[2][:, 0], t0, t1, aim[0], aim[2], sigma, scratch)
+            for q in range(r, last):
+                told = (colours[q], background[q])
+                loss += _along_ray(
+                    offsets[q], offsets[q + 1] - offsets[q], offsets[q] - first,
+                    room[5], scratch, aim, told, w, sigma, to_raw, to_rgb,
+                )  # fmt: skip
+            backward_block(to_raw[:n], to_rgb[:n], sizes, packed, room, back, sums, to_features[first : first + n])
+        losses[g] = loss
+
+
+def train_step(
+    batch: Batch,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    aim: Aim,
+    into: list[Tensor],
+) -> Stepped:
+    """See `reference.train_step`."""
+    tables, resolutions, networks = field
+    net = (tables, resolutions, networks[0], networks[1][0])
+    found = marched(batch.rays, space, grid, lattice, net, aim.stop)
+    n, rays = len(found.t_starts), len(batch.colours)
+    packed = pack(networks)
+    sums = group_sums(packed)
+    w, sigmas, losses = torch.empty(n), torch.empty(n), np.zeros(sums[0].shape[0])
+    to_features = np.empty_like(found.features)
+    told = (array(batch.rays[1]), array(batch.colours), array(batch.background))
+    numbers = tuple(np.float32(x) for x in (space[1], aim.distortion, aim.gradient_unit, rays))
+    outs = (w.numpy(), sigmas.numpy(), to_features)
+    _through(tuple(found), told, sizes_of(networks), packed, numbers, outs, sums, losses)
+    encode_backward(found.unit, to_features.view(np.float64), np.asarray(resolutions, np.int32), pairs(into[0]))
+    for total, grad in zip(into[1:], unpack(tuple(s.sum(0) for s in sums), networks)):
+        total += grad
+    return Stepped(float(losses.sum()), _cells(found, grid.shape[0]), w, sigmas, rays)
+
+
+def _cells(found: Marched, r: int) -> Tensor:
+    ijk = np.minimum((found.unit * np.float32(r)).astype(np.int64), r - 1)
+    return torch.from_numpy((ijk[:, 0] * r + ijk[:, 1]) * r + ijk[:, 2])

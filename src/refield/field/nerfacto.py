@@ -1,0 +1,203 @@
+"""The NeRFacto shape: a large hash field that is looked at where two small ones propose (§10.1).
+
+This is what the paper's experiments use, nerfstudio's default without camera optimiser and appearance embedding. It
+shares the world, the contraction and the kernels with `HashField` and nothing of how rays are sampled. Letters: S
+points, N rays, K intervals a ray.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+from refield.field import kernels
+from refield.field.encoding import Contraction, geometric_levels
+from refield.field.kernels.reference import truncated_exp
+from refield.field.networks import HashNetwork, weight
+from refield.field.proposal import Density, Histogram, Plan, Span, propose
+from refield.field.radiance import FORMAT
+from refield.field.sampling import OccupancySampler
+from refield.field.volrend import Samples
+from refield.scene.capture import Rays
+from refield.scene.errors import InputError
+
+
+@dataclass(frozen=True)
+class ProposalConfig:
+    """Shape of one proposal network, and how often it is asked."""
+
+    samples: int
+    """intervals a ray"""
+    finest: int
+    """cells a side of the contracted cube on the finest level"""
+    coarsest: int = 16
+    """cells a side on the coarsest level"""
+    levels: int = 5
+    """of the hash grid"""
+    log2_table: int = 17
+    """entries of a level's table"""
+    width: int = 16
+    """of the hidden layer"""
+
+
+@dataclass(frozen=True)
+class NerfactoConfig:
+    """Shape of a `NerfactoField`."""
+
+    proposals: tuple[ProposalConfig, ...] = (ProposalConfig(256, 128), ProposalConfig(96, 256))
+    """the proposal networks, in the order in which they are asked"""
+    samples: int = 48
+    """intervals a ray at which the field itself is asked"""
+    near: float = 0.05
+    """where rays begin, core radii"""
+    far: float = 1000.0
+    """where they end, core radii"""
+    levels: int = 16
+    """of the field's hash grid"""
+    coarsest: int = 16
+    """cells a side of the contracted cube on the coarsest level"""
+    finest: int = 2048
+    """cells a side on the finest level"""
+    log2_table: int = 19
+    """entries of a level's table"""
+    width: int = 64
+    """of all hidden layers but the proposals'"""
+    geometry_features: int = 15
+    """handed from the density to the colour network"""
+    first_density: float = 0.01
+    """per core radius, where the networks say nothing yet; low, so that light gets through from the start"""
+    occupancy: int = 128
+    """cells a side of the occupancy grid for those who march through the field instead of proposing"""
+    step: float = 1 / 192
+    """length of a sample for them, core radii"""
+
+
+class NerfactoField(nn.Module):
+    """Hash grid → density network → colour network, and the proposal networks that know where to ask it."""
+
+    def __init__(self, config: NerfactoConfig, sampler: OccupancySampler, seed: int = 0) -> None:
+        super().__init__()
+        g = torch.Generator().manual_seed(seed)
+        self.config, self.sampler = config, sampler
+        w, k = config.width, config.geometry_features
+        levels = geometric_levels(config.coarsest, config.finest, config.levels)
+        self.trunk = HashNetwork(levels, config.log2_table, (w, 1 + k), g)
+        self.colour_in = weight(w, k + 16, g)
+        self.colour_mid = weight(w, w, g)
+        self.colour_out = weight(3, w, g)
+        shapes = ((p, geometric_levels(p.coarsest, p.finest, p.levels)) for p in config.proposals)
+        self.proposals = nn.ModuleList(HashNetwork(r, p.log2_table, (p.width, 1), g) for p, r in shapes)
+
+    @property
+    def contraction(self) -> Contraction:
+        return self.sampler.contraction
+
+    def density(self, x: Tensor) -> Tensor:
+        """World points (..., 3) -> sigma (...,), per world unit."""
+        return self._sigma(self.trunk(self._contracted(x), slice(1))[:, 0]).reshape(x.shape[:-1])
+
+    def forward(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+        """World points (..., 3), unit directions (..., 3) -> sigma (...,), rgb (..., 3) in [0, 1]."""
+        out = self.trunk(self._contracted(x))
+        features = torch.cat([out[:, 1:], kernels.spherical_harmonics(d.reshape(-1, 3))], -1)
+        hidden = functional.relu(functional.linear(features, self.colour_in))
+        hidden = functional.relu(functional.linear(hidden, self.colour_mid))
+        rgb = torch.sigmoid(functional.linear(hidden, self.colour_out))
+        return self._sigma(out[:, 0]).reshape(x.shape[:-1]), rgb.reshape(x.shape)
+
+    @property
+    def span(self) -> Span:
+        """The part of a ray that is looked at."""
+        return Span(self.config.near, self.config.far, self.contraction.radius)
+
+    @property
+    def densities(self) -> tuple[Density, ...]:
+        """What the proposal networks take the density to be, at world points (S, 3)."""
+
+        def asking(network: nn.Module) -> Density:
+            return lambda x: self._sigma(network(self._contracted(x))[:, 0])
+
+        return tuple(asking(p) for p in self.proposals)
+
+    def propose(
+        self, rays: Rays, jitter: bool = False, anneal: float = 1.0, densities: tuple[Density, ...] | None = None
+    ) -> tuple[tuple[Histogram, ...], Tensor]:
+        """The proposals' histograms of N rays, and the edges (N, K + 1) in s at which to ask the field.
+
+        ``densities`` may ask the proposal networks elsewhere than where a sample lies (Eq. 16).
+        """
+        counts = (*(p.samples for p in self.config.proposals), self.config.samples)
+        return propose(rays, densities or self.densities, Plan(self.span, counts, anneal), jitter)
+
+    def samples(self, rays: Rays, jitter: bool = False) -> Samples:
+        """Where to evaluate the field along rays: where the proposal networks expect something to be seen."""
+        with torch.no_grad():
+            _, edges = self.propose(rays, jitter)
+            return self.span.samples(edges)
+
+    def _contracted(self, x: Tensor) -> Tensor:
+        return self.contraction(x.reshape(-1, 3))
+
+    def _sigma(self, raw: Tensor) -> Tensor:
+        return truncated_exp(raw) * (self.config.first_density / self.contraction.radius)
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Everything needed to rebuild the field: named tensors, and facts that JSON can hold."""
+        s = self.sampler
+        tensors = {k: v.detach().contiguous() for k, v in self.state_dict().items()}
+        tensors["occupancy"] = s.grid.contiguous()
+        facts = {
+            "architecture": "NerfactoField",
+            "config": asdict(self.config),
+            "contraction": {"centre": s.contraction.centre.tolist(), "radius": s.contraction.radius},
+            "sampler": {"step": s.step, "near": s.near, "far": s.far},
+        }
+        return tensors, facts
+
+    @staticmethod
+    def from_state(tensors: dict[str, Tensor], facts: dict[str, Any]) -> NerfactoField:
+        """Inverse of :meth:`state`. Raises KeyError, TypeError or RuntimeError if something is missing or of another
+        shape."""
+        tensors, shape = dict(tensors), dict(facts["config"])
+        shape["proposals"] = tuple(ProposalConfig(**p) for p in shape["proposals"])
+        space = Contraction(torch.tensor(facts["contraction"]["centre"]), facts["contraction"]["radius"])
+        sampler = OccupancySampler(space, tensors.pop("occupancy"), **facts["sampler"])
+        field = NerfactoField(NerfactoConfig(**shape), sampler)
+        field.load_state_dict(tensors)
+        return field.eval().requires_grad_(False)
+
+    def save(self, folder: Path) -> None:
+        """Write ``field.safetensors`` and ``field.json`` into an existing folder."""
+        tensors, facts = self.state()
+        save_file(tensors, str(folder / "field.safetensors"))
+        (folder / "field.json").write_text(json.dumps({"format": FORMAT, **facts}, indent=1) + "\n")
+
+    @staticmethod
+    def load(folder: Path) -> NerfactoField:
+        """Inverse of :meth:`save`. Raises InputError naming the file that is missing or not ours."""
+        try:
+            facts = json.loads((folder / "field.json").read_text())
+            if facts.get("format") != FORMAT or facts.get("architecture") != "NerfactoField":
+                raise ValueError(f"format {facts.get('format')!r} of {facts.get('architecture')!r}")
+            return NerfactoField.from_state(load_file(str(folder / "field.safetensors")), facts)
+        except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
+            raise InputError(folder, f"holds no readable field ({error})", "train it again") from error
+
+    def looking_where(self, grid: Tensor) -> None:
+        """Replace the occupancy grid (R, R, R) uint8 that others march through; own samples do not heed it."""
+        self.sampler = replace(self.sampler, grid=grid)
+
+
+def looking_everywhere(contraction: Contraction, config: NerfactoConfig) -> OccupancySampler:
+    """A sampler that leaves nothing out, for those who only ask where a field may hold something."""
+    grid = torch.ones(config.occupancy, config.occupancy, config.occupancy, dtype=torch.uint8)
+    near, step = (u * contraction.radius for u in (config.near, config.step))
+    return OccupancySampler(contraction, grid, step, near, config.far)
