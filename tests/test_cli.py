@@ -174,6 +174,16 @@ def test_ctrl_c_leaves_no_workspace(place, monkeypatch, capsys):
     assert not (place / "out").exists()
 
 
+def test_a_fit_that_breaks_down_keeps_its_last_good_state_and_says_so(place, monkeypatch, capsys):
+    from refield.field import kernels
+
+    whole = kernels.train_step
+    monkeypatch.setattr(kernels, "train_step", lambda *args: whole(*args)._replace(loss=float("nan")))
+    assert main(["train", "data", "out", *TINY_FIT]) == 0
+    assert "the last good state is kept" in " ".join(capsys.readouterr().err.split())
+    assert (place / "out/field/field.safetensors").is_file()
+
+
 def test_faults_of_ours_keep_their_traceback(place, monkeypatch):
     def broken(*args):
         raise RuntimeError("a fault")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +12,18 @@ import pytest
 import torch
 from PIL import Image
 
-from refield.field.fit import FitConfig, FitProgress, fit_field, place_contraction, rate_factor
+from refield.field import kernels
+from refield.field.fit import (
+    MOST_SKIPPED,
+    FitConfig,
+    FitProgress,
+    NonFiniteError,
+    fit_field,
+    place_contraction,
+    rate_factor,
+)
+from refield.field.memory import memory_of
+from refield.field.pixels import PixelBank
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_frame
 from refield.scene.camera import Camera
@@ -142,3 +155,63 @@ def test_learning_rate_is_held_then_falls() -> None:
     assert rate_factor(0.0) == rate_factor(0.5) == 1
     assert 0.03 < rate_factor(1.0) < 0.04
     assert rate_factor(0.9) < rate_factor(0.7) < 1
+
+
+def broken(monkeypatch: pytest.MonkeyPatch, bad: Callable[[int], bool], gradient: bool) -> list[int]:
+    """Make the loss, or one of its gradients, NaN in chosen steps; the list holds the steps taken."""
+    whole, steps = kernels.train_step, []
+
+    def step(*args):  # type: ignore[no-untyped-def]
+        done = whole(*args)
+        steps.append(len(steps))
+        if not bad(steps[-1]):
+            return done
+        args[-1][3][0, 0] = math.nan
+        return done if gradient else done._replace(loss=math.nan)
+
+    monkeypatch.setattr(kernels, "train_step", step)
+    return steps
+
+
+@pytest.mark.parametrize("gradient", [False, True])
+def test_a_step_that_is_not_finite_is_left_out(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch, gradient: bool
+) -> None:
+    steps = broken(monkeypatch, lambda i: i % 3 == 1, gradient)
+    field = fit_field(capture, replace(TINY, steps=60))
+    assert len(steps) == 60
+    assert all(bool(p.isfinite().all()) for p in field.parameters())
+
+
+def test_training_that_stays_not_finite_stops_with_its_last_good_state(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = broken(monkeypatch, lambda i: i >= 150, gradient=False)
+    with pytest.raises(NonFiniteError, match=f"{MOST_SKIPPED} steps in a row") as caught:
+        fit_field(capture, replace(TINY, steps=400))
+    assert len(steps) == 150 + MOST_SKIPPED
+    field = caught.value.field
+    assert field is not None and not field.training
+    view = capture.held_out[0]
+    error = (render_frame(field, view).rgb - frame_image(view).float() / 255).square().mean()
+    assert -10 * math.log10(float(error)) > 15  # a field that had learnt something
+
+
+def test_pixels_beyond_the_budget_are_drawn_from_every_photo(capture: Capture) -> None:
+    whole, part = PixelBank(capture.train), PixelBank(capture.train, most=5000)
+    assert len(part) <= 5000 < len(whole) and part.starts.diff().min() > 80
+    mine = torch.randint(len(part), (200,))
+    owner = part.frame_of(mine)
+    assert part._places is not None
+    same = whole.starts[owner] + part._places[mine]
+    assert torch.equal(part.colours(mine), whole.colours(same))
+    assert torch.equal(part.rays(mine).directions, whole.rays(same).directions)
+
+
+def test_memory_is_known_before_it_is_taken(capture: Capture) -> None:
+    needed = memory_of(capture, TINY)
+    assert needed.photos == 3 * len(PixelBank(capture.train))
+    held = memory_of(capture, replace(TINY, photo_memory=7e-6))
+    assert held.photos == 7000 and len(PixelBank(capture.train, most=1000)) <= 1000
+    assert "photos" in str(needed)
+    fit_field(capture, replace(TINY, steps=20, photo_memory=7e-6))

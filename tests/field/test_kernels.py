@@ -233,3 +233,55 @@ def test_train_step_is_the_same_bit_for_bit_for_any_number_of_threads() -> None:
         numba.set_num_threads(before)
     for a, b in zip(results[0], results[-1]):
         assert torch.equal(a, b)
+
+
+def test_hash_density_is_the_field_s() -> None:
+    torch.manual_seed(10)
+    for levels, width, samples in ((10, 32, 3001), (3, 8, 5), (2, 20, 0)):
+        resolutions, nets = geometric_levels(4, 200, levels), networks(levels, width, 3)
+        tables, unit = torch.randn(levels, 1 << 10, 2), torch.rand(samples, 3)
+        net = (tables, resolutions, nets[0], nets[1][0])
+        raw, _ = reference.hash_field(unit, torch.zeros(samples, 3), tables, resolutions, nets)
+        for twin in (reference, cpu):
+            close(twin.hash_density(unit, net), raw)
+
+
+def test_what_cells_are_known_to_hold() -> None:
+    torch.manual_seed(11)
+    states = []
+    cells = torch.randint(0, 300, (2, 500))
+    w, sigmas = torch.rand(2, 500), torch.rand(2, 500) * 20
+    for twin in (reference, cpu):
+        state = torch.stack([torch.full((400,), 0.5), torch.full((400,), 0.9), torch.rand(400) * 0 + 0.1], -1)
+        state = torch.cat([state, torch.full((400, 1), -1.0)], -1)
+        for i in range(2):
+            twin.observe(state, i + 1, 0.8, cells[i], w[i], sigmas[i])
+        allowed = torch.arange(400) % 3 > 0
+        states.append((state, *(twin.keep(state, allowed, 0.45, 0.8, only) for only in (False, True))))
+    for truth, fast in zip(*states):
+        torch.testing.assert_close(fast, truth)
+    state, every, seen = states[0]
+    assert (state[300:, :2] == torch.tensor([0.5, 0.9])).all()  # what is not seen does not fade
+    assert every[301:].any() and not seen[301:].any()
+
+
+@pytest.mark.parametrize("side", [16, 18])
+def test_reach_never_passes_over_what_is_there(side: int) -> None:
+    from refield.field.kernels.cpu import marching
+
+    torch.manual_seed(12)
+    grid = (torch.rand(side, side, side) < 2e-3).to(torch.uint8)
+    found = marching.reach(grid)
+    some = (
+        torch.nn.functional.pad(grid, (0, -side % 4) * 3)
+        .unfold(0, 4, 4)
+        .unfold(1, 4, 4)
+        .unfold(2, 4, 4)
+        .amax((3, 4, 5))
+    )
+    full = some.nonzero()
+    for i, j, k in torch.cartesian_prod(*[torch.arange(n) for n in found.shape]).tolist():
+        true = int((full - torch.tensor([i, j, k])).abs().amax(1).min())
+        assert found[i, j, k] == min(true, 8)
+    grid[0, 0, 0] = 1
+    assert marching.reach(grid)[0, 0, 0] == 0  # written to since

@@ -10,7 +10,8 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
-from refield.field.fit import FitConfig, fit_field
+from refield.field.fit import FitConfig, NonFiniteError, fit_field
+from refield.field.memory import Memory, memory_of
 from refield.scene.capture import Capture, centres
 from refield.scene.errors import InputError
 from refield.scene.load import load_capture
@@ -45,13 +46,20 @@ def train(data: Path, work: Path, clock: Clock, config: FitConfig, *, overwrite:
     Workspace.refuse_unless_free(work, overwrite=overwrite)
     clock.stage("load the capture")
     capture = load_capture(data, warn=clock.warn)
-    _check_memory(data, capture)
+    needed = memory_of(capture, config)
+    _check_memory(data, needed)
     _check_cameras(data, capture)
     with Workspace.building(work, overwrite=overwrite, made_by=made_by) as workspace:
         capture = workspace.keep_capture(capture)
-        clock.stage(f"fit a field to {len(capture.train)} photos")
-        with clock.training("fit") as line:
-            fitted = fit_field(capture, config, line)
+        clock.stage(f"fit a field to {len(capture.train)} photos (memory: {needed})")
+        try:
+            with clock.training("fit") as line:
+                fitted = fit_field(capture, config, line)
+        except NonFiniteError as error:
+            if error.field is None:
+                raise
+            fitted = error.field
+            clock.warn(f"{error}; the last good state is kept, look at it before you use it")
         clock.stage("keep the field")
         workspace.keep_field(fitted, line.psnr)
     clock.stop()
@@ -67,10 +75,10 @@ def _check_cameras(data: Path, capture: Capture) -> None:
         raise InputError(data, what, "give photos from many sides, 50 or more")
 
 
-def _check_memory(data: Path, capture: Capture) -> None:
+def _check_memory(data: Path, needed: Memory) -> None:
     """Refuse what would not fit, with the number, before the machine starts to swap."""
-    needed = 3 * sum(f.camera.width * f.camera.height for f in capture.frames)
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > there / 2:
-        what = f"its photos take {needed / 1e9:.1f} GB of memory, of which there are {there / 1e9:.1f}"
-        raise InputError(data, what, "scale the photos down, or give fewer")
+    if needed.total > there / 2:
+        what = f"its photos take {needed.photos / 1e9:.1f} GB of memory, of which there are {there / 1e9:.1f}"
+        most = max((there / 2 - needed.total + needed.photos) / 1e9, 0.1)
+        raise InputError(data, what, f"give --fit.photo-memory {most:.1f} or less, or scale the photos down")

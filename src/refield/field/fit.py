@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -18,8 +19,9 @@ from refield.field.occupancy import OccupancyTrainer
 from refield.field.pixels import PixelBank
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_many
-from refield.field.sampling import STOP, OccupancySampler
+from refield.field.sampling import RESOLUTION, STOP, OccupancySampler
 from refield.scene.capture import Capture, Frame, Rays
+from refield.scene.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,10 @@ class FitConfig:
     least_gain: float = 0.02
     """dB"""
     seed: int = 0
+    photo_memory: float | None = None
+    """GB for the photos' pixels; of more than fit, a part is kept, drawn from every photo alike"""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """where the fit runs; the field comes back to the CPU. The CUDA path was tested in an interpreter, not on a GPU"""
 
 
 @dataclass(frozen=True)
@@ -86,6 +92,7 @@ def fit_field(
 
     Raises:
         ValueError: no frame to train on.
+        InputError: a GPU is wanted and there is none.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row; it holds the last good state.
     """
     torch.manual_seed(config.seed)
@@ -94,14 +101,25 @@ def fit_field(
     if config.finest_auto:
         shape = replace(shape, finest=_finest_for(capture.train, contraction, shape.log2_table))
     step = 2 * contraction.radius * 4 / shape.finest  # about two pixels
-    grid = torch.ones(128, 128, 128, dtype=torch.uint8)
+    grid = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.uint8)
     model = HashField(shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), config.seed)
     try:
-        _Fit(model, capture, config, on_progress).run()
+        if config.device == "cuda":
+            _fit_on_gpu(model, capture, config, on_progress)
+        else:
+            _Fit(model, capture, config, on_progress).run()
     except NonFiniteError as error:
         error.field = model.eval().requires_grad_(False)
         raise
     return model.eval().requires_grad_(False)
+
+
+def _fit_on_gpu(model: HashField, capture: Capture, config: FitConfig, on_progress: ProgressCallback | None) -> None:
+    if not torch.cuda.is_available():
+        raise InputError("device cuda", "torch finds no CUDA GPU on this machine", "leave the option out")
+    from refield.field.gpu_fit import fit_on_gpu
+
+    fit_on_gpu(model, capture, config, on_progress)
 
 
 def place_contraction(capture: Capture) -> Contraction:
@@ -141,6 +159,11 @@ def _finest_for(frames: tuple[Frame, ...], contraction: Contraction, log2_table:
     distances = torch.stack([(f.centre.float() - contraction.centre).norm() / f.camera.fx for f in frames])
     wanted = 4 * contraction.radius / float(distances.median())
     return int(min(max(wanted, 256), 2.5 * 2 ** (log2_table / 2)))
+
+
+def most_pixels(config: FitConfig) -> int | None:
+    """How many pixels are kept of photos that do not fit into ``photo_memory``: 3 bytes each, and 4 for its place."""
+    return None if config.photo_memory is None else max(int(config.photo_memory * 1e9 / 7), 1)
 
 
 class TableAdam:
@@ -191,7 +214,7 @@ class _Fit:
         if not capture.train:
             raise ValueError("the capture has no frame to train on")
         self.model, self.config, self.on_progress = model, config, on_progress
-        self.pixels = PixelBank(capture.train)
+        self.pixels = PixelBank(capture.train, most=most_pixels(config))
         self.judge = HeldOut(capture.held_out)
         self.adam = TableAdam(model)
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, capture.train))
@@ -199,7 +222,7 @@ class _Fit:
         self.rays_per_step = 512
         self.samples_per_ray = config.samples / 512
         self.began = time.perf_counter()
-        self.rays_done = 0
+        self.rays_done, self.steps_done = 0, 0
         self.finest_step, self.coarseness = model.sampler.step, 1.0
         self._set_coarseness(COARSEST)
 
@@ -212,7 +235,7 @@ class _Fit:
             raise
         self.occupancy.settle(self.pixels)
         if self.on_progress:
-            self._look(self.config.steps)
+            self._look(self.steps_done)
 
     def _steps(self) -> None:
         looks: list[float] = []
@@ -221,6 +244,7 @@ class _Fit:
             if progress >= 1:
                 break
             self._step(step, progress)
+            self.steps_done = step + 1
             if (step + 1) % self.config.check_every == 0:
                 looks.append(self._look(step + 1))
                 if self._plateau(looks):
@@ -300,9 +324,8 @@ class HeldOut:
     def __init__(self, frames: tuple[Frame, ...], count: int = 16384) -> None:
         self.rays: Rays | None = None
         if frames:
-            bank = PixelBank(frames)
-            g = torch.Generator().manual_seed(0)
-            chosen = torch.randperm(len(bank), generator=g)[:count]
+            bank = PixelBank(frames, most=count)
+            chosen = torch.arange(len(bank))
             self.rays, self.truth = bank.rays(chosen), bank.colours(chosen)
 
     def psnr(self, model: HashField) -> float:

@@ -18,11 +18,12 @@ from refield.field.fit import (
     HeldOut,
     NonFiniteError,
     ProgressCallback,
+    most_pixels,
     rate_factor,
 )
 from refield.field.graphed import Descent, DevicePixels, GraphedStep
 from refield.field.kernels.reference import Aim
-from refield.field.occupancy import _DECAY, _EVERY, OccupancyTrainer
+from refield.field.occupancy import DECAY, EVERY, OccupancyTrainer
 from refield.field.pixels import PixelBank
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP
@@ -76,7 +77,7 @@ class _GpuFit:
         self.model, self.config = model, config
         device = model.encoding.tables.device
         with torch.device("cpu"):  # photos are read and posed there
-            self.pixels = DevicePixels(PixelBank(capture.train), device)
+            self.pixels = DevicePixels(PixelBank(capture.train, most=most_pixels(config)), device)
             self.judge = HeldOut(capture.held_out)
         if self.judge.rays is not None:
             r = self.judge.rays
@@ -89,7 +90,7 @@ class _GpuFit:
         self.capacity = config.samples * _BATCH
         self.rays_per_step, self.coarseness = _SIZES[0], COARSEST
         self.finest_step = model.sampler.step
-        self.began, self.rays_done = time.perf_counter(), 0
+        self.began, self.rays_done, self.step = time.perf_counter(), 0, 0
 
     def run(self) -> None:
         self.model.train()
@@ -99,7 +100,7 @@ class _GpuFit:
             self.occupancy.settle(self.pixels)  # type: ignore[arg-type]
             raise
         self.occupancy.settle(self.pixels)  # type: ignore[arg-type]
-        self._look(self.config.steps, samples / self.rays_per_step)
+        self._look(self.step, samples / self.rays_per_step)
 
     def _steps(self) -> int:
         """All rounds of steps, each followed by what a graph cannot hold; returns the samples of the last step."""
@@ -108,7 +109,7 @@ class _GpuFit:
         graph, step = self._captured(0)
         while self._progress(step) < 1:
             step = self._round(graph, step)
-            samples = int(graph.samples)
+            self.step, samples = step, int(graph.samples)
             if int(self.descent.bad) >= MOST_SKIPPED:
                 raise NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
             if step >= due:
@@ -122,13 +123,13 @@ class _GpuFit:
 
     def _round(self, graph: GraphedStep, step: int) -> int:
         """Steps up to the next update of the occupancy grid, and that."""
-        graph.now.fill_(1 + step // _EVERY)
-        for _ in range(_EVERY - step % _EVERY):
+        graph.now.fill_(self.occupancy.rounds)
+        for _ in range(EVERY - step % EVERY):
             self._set_rate(step)
             graph.replay()
             step += 1
             self.rays_done += self.rays_per_step
-        self.occupancy._update(step - 1)
+        self.occupancy.renew(step - 1)
         self.grid.copy_(self.model.sampler.grid)
         return step
 
@@ -139,9 +140,9 @@ class _GpuFit:
         space = (sampler.contraction.centre, sampler.contraction.radius)
         aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
         where = (space, self.grid, sampler.lattice, self.model.encoding.resolutions)
-        occupancy = (self.occupancy.state, _DECAY)
+        occupancy = (self.occupancy.state, DECAY)
         graph = GraphedStep(self.descent, self.pixels, where, aim, occupancy, (self.rays_per_step, self.capacity))
-        graph.now.fill_(1 + step // _EVERY)
+        graph.now.fill_(self.occupancy.rounds)
         self._set_rate(step)
         return graph, step + graph.capture()
 

@@ -11,10 +11,10 @@ from refield.field.radiance import HashField
 from refield.field.render import CHUNK
 from refield.field.volrend import weights
 
-_EVERY = 16  # steps between updates
+EVERY, _OFTEN_UNTIL = 16, 512  # steps between renewals of the grid; later every second one is left out
 _OPACITY = 5e-2  # a cell is kept if a sample in it would be more opaque than this
 _WEIGHT = 5e-3  # and if some ray gives it at least this much of its colour: hidden cells cost half of all samples
-_DECAY = 0.8
+DECAY = 0.8
 _PROBED_AT_FIRST, _PROBED = 16, 64  # one in so many cells, each time
 # Core radii; from the core to here cameras stand (see `place_contraction`). What is there must show itself: with the
 # benefit of the doubt a photo's background is learnt as haze before the cameras opposite, and new views meet it
@@ -38,6 +38,7 @@ class OccupancyTrainer:
         device = model.sampler.grid.device
         cells = model.sampler.resolution**3
         self.allowed = torch.ones(cells, dtype=torch.bool, device=device) if allowed is None else allowed
+        self.rounds = 1  # renewals of the grid, from 1
         self.open = self.allowed.nonzero()[:, 0]
         self.state = torch.zeros(cells, 4, device=device)
         """see `kernels.reference.observe`"""
@@ -54,25 +55,32 @@ class OccupancyTrainer:
         return self.state[:, 1]
 
     def observe(self, step: int, cells: Tensor, w: Tensor, sigmas: Tensor) -> None:
-        """After each step: samples' cells (S,), weights (S,), densities (S,). Renews the grid every 16 steps."""
-        kernels.observe(self.state, 1 + step // _EVERY, _DECAY, cells, w, sigmas)
-        if step % _EVERY == _EVERY - 1:
-            self._update(step)
+        """After each step: samples' cells (S,), weights (S,), densities (S,). Renews the grid every 16 or 32 steps."""
+        kernels.observe(self.state, self.rounds, DECAY, cells, w, sigmas)
+        every = EVERY if step < _OFTEN_UNTIL else 2 * EVERY
+        if step % every == every - 1:
+            self.renew(step)
 
-    def _update(self, step: int) -> None:
-        part = _PROBED_AT_FIRST if step < 4 * _EVERY else _PROBED
+    def renew(self, step: int) -> None:
+        """Look into some cells at random, and choose anew which are shown."""
+        part = _PROBED_AT_FIRST if step < 4 * EVERY else _PROBED
         cells = self.open[torch.randint(len(self.open), (len(self.open) // part,), device=self.open.device)]
-        self.state[cells, 0] = torch.maximum(self.state[cells, 0] * _DECAY, self._probe(cells))
+        self.state[cells, 0] = torch.maximum(self.state[cells, 0] * DECAY, self._probe(cells))
         if step >= self.cull_from:
             # a few hidden cells get another chance, since geometry still changes
             again = self.open[torch.randint(len(self.open), (len(self.open) // 100,), device=self.open.device)]
             self.state[again, 1] = self.state[again, 1].clamp_min(4 * _WEIGHT)
         self._set(_WEIGHT if step >= self.cull_from else -1.0, step >= 4 * self.cull_from)
+        self.rounds += 1
 
     def _probe(self, cells: Tensor) -> Tensor:
+        """Opacity of a sample at a random point of each cell, (K,) -> (K,)."""
+        r, model = self.model.sampler.resolution, self.model
+        corner = torch.stack([cells // (r * r), cells // r % r, cells % r], -1)
         with torch.no_grad():
-            parts = [self.model.density(self.model.sampler.points_in(c)) for c in cells.split(1 << 16)]
-        return -torch.expm1(-torch.cat(parts) * self.state[cells, 2])
+            unit = (corner + torch.rand(len(cells), 3, device=cells.device)) / r
+            sigma = model.sigma(kernels.hash_density(unit, model.density_net))
+        return -torch.expm1(-sigma * self.state[cells, 2])
 
     def _set(self, weight: float, only_seen: bool) -> None:
         """Show cells that are opaque enough and have a weight above ``weight``."""
@@ -91,7 +99,7 @@ class OccupancyTrainer:
                 self.state[cells, 0] = torch.maximum(self.state[cells, 0], self._probe(cells))
         self._set(-1.0, False)
         self.state[:, 1] = torch.where(self.state[:, 3] >= 0, self.state[:, 1], 0)
-        for chosen in torch.randperm(len(pixels))[:rays].split(CHUNK):
+        for chosen in torch.randint(len(pixels), (rays,)).split(CHUNK):
             r = pixels.rays(chosen)
             with torch.no_grad():
                 samples = self.model.samples(r, jitter=True)

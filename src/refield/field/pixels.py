@@ -11,29 +11,42 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays
 from refield.scene.images import frame_image
 
-_TABLE_BYTES = 1 << 29  # camera-space directions are kept for every pixel of every distinct camera up to here
+DIRECTIONS_MOST = 1 << 29  # bytes; camera-space directions are kept for every pixel of every distinct camera up to here
 
 
 class PixelBank:
     """P pixels of F photos in one row: colours uint8, rays made on demand."""
 
-    def __init__(self, frames: Sequence[Frame], images: Sequence[Tensor] | None = None) -> None:
+    def __init__(
+        self, frames: Sequence[Frame], images: Sequence[Tensor] | None = None, most: int | None = None
+    ) -> None:
+        """Photos are read one by one. Of more than ``most`` pixels so many are kept, drawn from every photo alike."""
         if not frames:
             raise ValueError("a pixel bank needs at least one frame")
-        images = [frame_image(f) for f in frames] if images is None else images
         self.frames = tuple(frames)
-        self.rgb = torch.cat([i.reshape(-1, 3) for i in images])
-        """(P, 3) uint8"""
         counts = torch.tensor([f.camera.width * f.camera.height for f in frames])
+        self._places: Tensor | None = None
+        parts = None
+        if most is not None and int(counts.sum()) > most:
+            g = torch.Generator().manual_seed(0)
+            share = most / int(counts.sum())
+            parts = [torch.randperm(int(n), generator=g)[: max(int(n * share), 1)].sort().values for n in counts]
+            self._places = torch.cat([p.int() for p in parts])
+            counts = torch.tensor([len(p) for p in parts])
         self.starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
         """(F + 1,) int64: frame i owns pixels ``starts[i] : starts[i + 1]``, row by row"""
+        self.rgb = torch.empty(int(counts.sum()), 3, dtype=torch.uint8)
+        """(P, 3) uint8"""
+        for i, frame in enumerate(frames):
+            image = (frame_image(frame) if images is None else images[i]).reshape(-1, 3)
+            self.rgb[self.starts[i] : self.starts[i + 1]] = image if parts is None else image[parts[i]]
         self._rotations = torch.stack([f.world_from_cam[:3, :3] for f in frames]).float()
         self._centres = torch.stack([f.centre for f in frames]).float()
         self._cameras = list(dict.fromkeys(f.camera for f in frames))
         self._camera_of = torch.tensor([self._cameras.index(f.camera) for f in frames])
         self._tables: dict[Camera, Tensor] = {}
         distinct = sum(c.width * c.height for c in self._cameras)
-        self._tabulate = distinct * 12 <= _TABLE_BYTES
+        self._tabulate = distinct * 12 <= DIRECTIONS_MOST
 
     def __len__(self) -> int:
         return int(self.starts[-1])
@@ -45,7 +58,7 @@ class PixelBank:
     def rays(self, pixels: Tensor) -> Rays:
         """World rays through pixel centres, (B,) -> Rays of B."""
         owner = self.frame_of(pixels)
-        local = pixels - self.starts[owner]
+        local = pixels - self.starts[owner] if self._places is None else self._places[pixels].long()
         d = torch.empty(len(pixels), 3)
         for k, camera in enumerate(self._cameras):
             mine = slice(None) if len(self._cameras) == 1 else (self._camera_of[owner] == k).nonzero()[:, 0]

@@ -93,14 +93,14 @@ class HashField(nn.Module):
             raw = functional.linear(self._hidden(flat), self.density_out[:1])[:, 0]
         else:
             raw = kernels.hash_density(self._unit(flat), self.density_net)
-        return self._where_seen(self._sigma(raw), flat).reshape(x.shape[:-1])
+        return self._where_seen(self.sigma(raw), flat).reshape(x.shape[:-1])
 
     def forward(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """World points (..., 3), unit directions (..., 3) -> sigma (...,), rgb (..., 3) in [0, 1]."""
         flat = x.reshape(-1, 3)
         enc = self.encoding
         raw, rgb = kernels.hash_field(self._unit(flat), d.reshape(-1, 3), enc.tables, enc.resolutions, self.networks)
-        return self._where_seen(self._sigma(raw), flat).reshape(x.shape[:-1]), rgb.reshape(x.shape)
+        return self._where_seen(self.sigma(raw), flat).reshape(x.shape[:-1]), rgb.reshape(x.shape)
 
     def samples(self, rays: Rays, jitter: bool = False) -> Samples:
         """Where to evaluate the field along rays: the sampler's places, ended behind the first opaque surface."""
@@ -122,7 +122,8 @@ class HashField(nn.Module):
     def _hidden(self, flat: Tensor) -> Tensor:
         return functional.relu(functional.linear(self.encoding(self.contraction(flat)), self.density_in))
 
-    def _sigma(self, raw: Tensor) -> Tensor:
+    def sigma(self, raw: Tensor) -> Tensor:
+        """The density network's first output -> density, per world unit."""
         return truncated_exp(raw) / self.contraction.radius
 
     def _where_seen(self, sigma: Tensor, x: Tensor) -> Tensor:

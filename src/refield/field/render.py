@@ -42,7 +42,8 @@ def render_many(field: Field, rays: Rays, chunk: int = CHUNK) -> Rendering:
 
 def render_camera(field: Field, camera: Camera, world_from_cam: Tensor, chunk: int = CHUNK) -> Rendering:
     """The view of a posed camera; leading shape (height, width)."""
-    rendering = render_many(field, camera_rays(camera, world_from_cam), chunk)
+    rays, device = camera_rays(camera, world_from_cam), field.sampler.grid.device
+    rendering = render_many(field, Rays(rays.origins.to(device), rays.directions.to(device)), chunk)
     return rendering.reshape(camera.height, camera.width)
 
 

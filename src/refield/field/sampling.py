@@ -14,6 +14,7 @@ from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
 
+RESOLUTION = 128  # cells a side of the occupancy grid
 STOP = 7.0  # optical depth at which a ray ends: e^-7 is a thousandth
 
 
@@ -114,16 +115,16 @@ class OccupancySampler:
     def cells_in(self, box: Tensor) -> Tensor:
         """Flat indices of the cells whose contracted extent meets a world box (2, 3), one cell of margin."""
         r = self.resolution
-        corners = torch.cartesian_prod(*torch.as_tensor(box, dtype=torch.float32).T)
+        corners = torch.cartesian_prod(*torch.as_tensor(box, dtype=torch.float32, device=self.grid.device).T)
         y = (self.contraction(corners) + 2) * (r / 4)
         lo, hi = (y.amin(0) - 1).long().clamp(0, r - 1), (y.amax(0) + 1).long().clamp(0, r - 1)
-        axes = [torch.arange(int(a), int(b) + 1) for a, b in zip(lo, hi)]
+        axes = [torch.arange(int(a), int(b) + 1, device=self.grid.device) for a, b in zip(lo, hi)]
         i, j, k = torch.meshgrid(*axes, indexing="ij")
         return ((i * r + j) * r + k).reshape(-1)
 
     @staticmethod
     def from_density(
-        density: Callable[[Tensor], Tensor], contraction: Contraction, step: float, resolution: int = 128
+        density: Callable[[Tensor], Tensor], contraction: Contraction, step: float, resolution: int = RESOLUTION
     ) -> OccupancySampler:
         """Look the whole world up in ``density``."""
         empty = torch.zeros(resolution, resolution, resolution, dtype=torch.uint8)

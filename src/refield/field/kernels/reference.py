@@ -210,7 +210,9 @@ def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Te
         t = t + dt
         going = t < far
         live, t = live[going], t[going]
-    owner = torch.cat(owners) if owners else torch.zeros(0, dtype=torch.long)
+    if not owners:  # no ray at all
+        return t, t, torch.zeros(1, dtype=torch.long, device=t.device)
+    owner = torch.cat(owners)
     order = torch.argsort(owner, stable=True)
     counts = torch.bincount(owner, minlength=len(origins))
     offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])

@@ -5,6 +5,10 @@ A table's two features are one float64 to the loops (see `simd.fma_pair`): half 
 
 from __future__ import annotations
 
+import math
+import threading
+from typing import Any
+
 import numpy as np
 import torch
 from numba import get_num_threads, njit, prange
@@ -29,7 +33,21 @@ def pairs(tables: Tensor) -> np.ndarray:
     return array(tables).view(np.float64)[..., 0]
 
 
-@njit(inline="always", **JIT)
+_buffers = threading.local()
+
+
+def scratch(name: str, shape: tuple[int, ...], kind: Any = np.float32) -> np.ndarray:
+    """An array to work in, of this thread, uninitialised and kept: fresh pages cost more than what is done with them.
+
+    The next call by the same name gives the same memory.
+    """
+    size, known = math.prod(shape), vars(_buffers)
+    if name not in known or known[name].size < size:
+        known[name] = np.empty(size + size // 4, kind)
+    return known[name][:size].reshape(shape)
+
+
+@njit(forceinline=True, **JIT)
 def _dense_rows(i, j, k, side, rows, s):  # type: ignore[no-untyped-def]
     base = (i * side + j) * side + k
     rows[0, s], rows[1, s] = base, base + np.uint32(1)
@@ -39,7 +57,7 @@ def _dense_rows(i, j, k, side, rows, s):  # type: ignore[no-untyped-def]
     rows[6, s], rows[7, s] = far + side, far + side + np.uint32(1)
 
 
-@njit(inline="always", **JIT)
+@njit(forceinline=True, **JIT)
 def _hashed_rows(i, j, k, mask, rows, s):  # type: ignore[no-untyped-def]
     far, b, c = i + np.uint32(1), j * _P1, k * _P2
     e, f = b + _P1, c + _P2
@@ -49,7 +67,7 @@ def _hashed_rows(i, j, k, mask, rows, s):  # type: ignore[no-untyped-def]
     rows[6, s], rows[7, s] = (far ^ e ^ c) & mask, (far ^ e ^ f) & mask
 
 
-@njit(inline="always", **JIT)
+@njit(forceinline=True, **JIT)
 def _weights(fx, fy, fz, wts, s):  # type: ignore[no-untyped-def]
     gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
     a, b, c, d = gx * gy, gx * fy, fx * gy, fx * fy
@@ -57,7 +75,7 @@ def _weights(fx, fy, fz, wts, s):  # type: ignore[no-untyped-def]
     wts[4, s], wts[5, s], wts[6, s], wts[7, s] = c * gz, c * fz, d * gz, d * fz
 
 
-@njit(inline="always", **JIT)
+@njit(forceinline=True, **JIT)
 def corners(unit, first, n, resolution, size, rows, wts):  # type: ignore[no-untyped-def]
     """Table rows (8, n) and trilinear weights (8, n) around unit positions ``first : first + n``."""
     res, top = np.float32(resolution), np.float32(resolution - 1)

@@ -15,41 +15,33 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-from refield.field.kernels.cpu.encoding import array, encode_part, pairs, parts_of
+from refield.field.kernels.cpu.encoding import array, encode_part, pairs, parts_of, scratch
 from refield.field.kernels.cpu.networks import padded
 from refield.field.kernels.cpu.simd import JIT, exp, product
 from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 
 _ZERO, _ONE, _TWO, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
 _BLOCK = 128  # samples whose hidden layer is held at once
-_BLOCKS, _FAR = 4, 8  # cells a side that are skipped together; blocks
+_BLOCKS, _FAR = 4, 8  # cells a side that are skipped together; the furthest that is looked for, in blocks
 _ROOM = 32  # samples a ray that are made room for at first
 
 
-@njit(**JIT)
-def _reach(grid, out):  # type: ignore[no-untyped-def]
-    """Per block of _BLOCKS^3 cells: how many blocks away (L-infinity, at most _FAR) the next occupied one is."""
-    n = out.shape[0]
-    out[:] = _FAR
-    for i in range(grid.shape[0]):
-        for j in range(grid.shape[1]):
-            for k in range(0, grid.shape[2], _BLOCKS):
-                some = np.uint8(0)
-                for l in range(k, min(k + _BLOCKS, grid.shape[2])):
-                    some |= grid[i, j, l]
-                if some:
-                    out[i // _BLOCKS, j // _BLOCKS, k // _BLOCKS] = 0
-    for way in (1, -1):  # there and back: the chessboard distance is exact after two sweeps
-        begin, end = (0, n) if way > 0 else (n - 1, -1)
-        for i in range(begin, end, way):
-            for j in range(begin, end, way):
-                for k in range(begin, end, way):
-                    least = np.int64(out[i, j, k])
-                    for a in range(max(i - 1, 0), min(i + 2, n)):
-                        for b in range(max(j - 1, 0), min(j + 2, n)):
-                            for c in range(max(k - 1, 0), min(k + 2, n)):
-                                least = min(least, np.int64(out[a, b, c]) + 1)
-                    out[i, j, k] = least
+def _reach(grid: np.ndarray) -> np.ndarray:
+    """Per block of _BLOCKS^3 cells: chessboard distance to the next with something in it, in blocks, at most _FAR."""
+    side = -(-grid.shape[0] // _BLOCKS)
+    full = np.ascontiguousarray(np.pad(grid, (0, side * _BLOCKS - grid.shape[0])))
+    rows = full.view(np.uint32) != 0  # _BLOCKS cells of one byte
+    near = rows.reshape(side, _BLOCKS, side, _BLOCKS, side).any((1, 3)).astype(np.uint8)
+    out = np.zeros_like(near)
+    for _ in range(_FAR):
+        out += 1 - near
+        for axis in range(3):
+            here = np.moveaxis(near, axis, 0)
+            wide = here.copy()
+            np.maximum(wide[1:], here[:-1], out=wide[1:])
+            np.maximum(wide[:-1], here[1:], out=wide[:-1])
+            near = np.moveaxis(wide, 0, axis)
+    return out
 
 
 _reaches: list[tuple[Any, int, np.ndarray]] = []
@@ -60,14 +52,12 @@ def reach(grid: Tensor) -> np.ndarray:
     for known, version, found in _reaches:
         if known() is grid and version == grid._version:
             return found
-    side = -(-grid.shape[0] // _BLOCKS)
-    found = np.empty((side, side, side), np.uint8)
-    _reach(array(grid), found)
+    found = _reach(array(grid))
     _reaches[:] = [(weakref.ref(grid), grid._version, found), *_reaches[:3]]
     return found
 
 
-@njit(inline="always", **JIT)
+@njit(forceinline=True, **JIT)
 def _leave(p, inverse, size, many):  # type: ignore[no-untyped-def]
     """Distance until the coordinate p, in cells, leaves ``many`` cubes of ``size`` cells; inverse: per cell of p."""
     cube = np.float32(math.floor(p / size))  # a power of two: exact
@@ -75,7 +65,7 @@ def _leave(p, inverse, size, many):  # type: ignore[no-untyped-def]
     return (edge - p) * inverse
 
 
-@njit(inline="always", **JIT)
+@njit(forceinline=True, **JIT)
 def _next(ray, t, far, step, grid, reaches, unit):  # type: ignore[no-untyped-def]
     """The first lattice interval at or after t whose midpoint lies in an occupied cell: (t, dt); dt = 0 if none.
 
@@ -105,20 +95,32 @@ def _next(ray, t, far, step, grid, reaches, unit):  # type: ignore[no-untyped-de
             unit[0], unit[1], unit[2] = a * quarter, b * quarter, c * quarter
             return t, dt
         if m < _ONE:
-            # all lattice midpoints in what is empty can be skipped; one is kept back for rounding
+            # lattice midpoints in what is empty are skipped; a hair is kept back for rounding
             size, many = (np.float32(_BLOCKS), np.float32(empty)) if empty > 0 else (_ONE, _ONE)
             leave = min(
                 min(_leave(p, ray[6], size, many), _leave(q, ray[7], size, many)),
                 min(_leave(o, ray[8], size, many), (_ONE - m) * ray[9]),
             )
-            skip = np.float32(math.floor(leave * ray[10])) - _ONE
+            skip = np.float32(math.floor(leave * ray[10] - np.float32(1e-3)))
             if skip > 0:
                 t += step * skip
+        elif empty > 1:
+            # outside the core the lattice has to be walked, but without a look at the grid; the contraction lengthens
+            # nothing by more than 4/3
+            safe = t + np.float32(empty - 1) * np.float32(0.75 * _BLOCKS) / per_unit * ray[9]
+            t += dt
+            while t < safe:
+                m = max(abs(u0 + v0 * t), max(abs(u1 + v1 * t), abs(u2 + v2 * t)))
+                dt = step if m <= _ONE else step * m * np.float32(math.sqrt(m))
+                if t + dt >= safe:
+                    break
+                t += dt
+            continue
         t += dt
     return t, _ZERO
 
 
-@njit(inline="always", **JIT)
+@njit(forceinline=True, **JIT)
 def _start(rays, space, lattice, per_unit, r, ray):  # type: ignore[no-untyped-def]
     """Ray r in core radii into ``ray`` (11,); returns its first t.
 
@@ -137,24 +139,31 @@ def _start(rays, space, lattice, per_unit, r, ray):  # type: ignore[no-untyped-d
     return np.float32(lattice[0]) + jitter[r] * np.float32(lattice[2])
 
 
+@njit(**JIT)
+def _march_part(begin, end, rays, space, grids, lattice, t0, t1, counts):  # type: ignore[no-untyped-def]
+    grid, reaches = grids
+    far, step = np.float32(lattice[1]), np.float32(lattice[2])
+    ray, unit = np.empty(11, np.float32), np.empty(3, np.float32)
+    for r in range(begin, end):
+        t = _start(rays, space, lattice, np.float32(grid.shape[0] / 4), r, ray)
+        found = 0
+        while True:
+            t, dt = _next(ray, t, far, step, grid, reaches, unit)
+            if dt == 0:
+                break
+            if found < t0.shape[1]:
+                t0[r, found], t1[r, found] = t, t + dt
+            found += 1
+            t += dt
+        counts[r] = found
+
+
 @njit(parallel=True, **JIT)
-def _march(rays, space, grid, reaches, lattice, t0, t1, counts):  # type: ignore[no-untyped-def]
+def _march(rays, space, grids, lattice, t0, t1, counts):  # type: ignore[no-untyped-def]
     """Fills row r of t0, t1 (N, K) and counts[r]; counts may exceed K, then the caller retries with a wider K."""
-    n, far, step = rays[0].shape[0], np.float32(lattice[1]), np.float32(lattice[2])
+    n = rays[0].shape[0]
     for b in prange((n + 63) // 64):
-        ray, unit = np.empty(11, np.float32), np.empty(3, np.float32)
-        for r in range(b * 64, min(n, (b + 1) * 64)):
-            t = _start(rays, space, lattice, np.float32(grid.shape[0] / 4), r, ray)
-            found = 0
-            while True:
-                t, dt = _next(ray, t, far, step, grid, reaches, unit)
-                if dt == 0:
-                    break
-                if found < t0.shape[1]:
-                    t0[r, found], t1[r, found] = t, t + dt
-                found += 1
-                t += dt
-            counts[r] = found
+        _march_part(b * 64, min(n, (b + 1) * 64), rays, space, grids, lattice, t0, t1, counts)
 
 
 @njit(parallel=True, **JIT)
@@ -182,7 +191,7 @@ def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Te
     arrays, place = _arrays(rays, space)
     while True:
         t0, t1 = np.empty((n, room), np.float32), np.empty((n, room), np.float32)
-        _march(arrays, place, array(grid), reach(grid), lattice, t0, t1, counts)
+        _march(arrays, place, (array(grid), reach(grid)), lattice, t0, t1, counts)
         most = int(counts.max(initial=0))
         if most <= room:
             break
@@ -196,7 +205,7 @@ def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Te
 # --- waves -----------------------------------------------------------------------------------------------------------
 
 
-@njit(inline="never", **JIT)
+@njit(**JIT)
 def _raw_density(features, first, n, sizes, w_in, w_out, x, hidden, raw):  # type: ignore[no-untyped-def]
     """The density network's first output for n <= _BLOCK samples of features (S, F), into raw (n,)."""
     f, h = sizes
@@ -214,7 +223,7 @@ def _raw_density(features, first, n, sizes, w_in, w_out, x, hidden, raw):  # typ
         raw[s] = total
 
 
-@njit(inline="never", **JIT)
+@njit(**JIT)
 def _wave_part(begin, end, rays, space, grids, lattice, net, arena):  # type: ignore[no-untyped-def]
     """March rays ``begin : end``; the samples, wave by wave, into ``arena``. Returns how many, or -1 without room."""
     tables, resolutions, w_in, w_out, stop = net
@@ -286,19 +295,25 @@ def _sort(arena, found, cursor, out):  # type: ignore[no-untyped-def]
                 out[4][to, c] = arena[4][p, i, c]
 
 
+@njit(**JIT)
+def _densities_part(unit, net, out):  # type: ignore[no-untyped-def]
+    tables, resolutions, w_in, w_out = net
+    n = len(out)
+    features = np.empty((n, w_in.shape[0]), np.float32)
+    encode_part(unit, 0, n, tables, resolutions, features.view(np.float64))
+    x, hidden = np.zeros((_BLOCK, w_in.shape[0]), np.float32), np.empty((_BLOCK, w_in.shape[1]), np.float32)
+    for first in range(0, n, _BLOCK):
+        some = min(_BLOCK, n - first)
+        sizes = (w_in.shape[0], len(w_out))
+        _raw_density(features, first, some, sizes, w_in, w_out, x, hidden, out[first : first + some])
+
+
 @njit(parallel=True, **JIT)
 def _densities(unit, net, out, parts):  # type: ignore[no-untyped-def]
-    tables, resolutions, w_in, w_out = net
     n = len(out)
     for p in prange(parts):
         begin, end = n * p // parts, n * (p + 1) // parts
-        features = np.empty((end - begin, w_in.shape[0]), np.float32)
-        encode_part(unit[begin:end], 0, end - begin, tables, resolutions, features.view(np.float64))
-        x, hidden = np.zeros((_BLOCK, w_in.shape[0]), np.float32), np.empty((_BLOCK, w_in.shape[1]), np.float32)
-        for first in range(0, end - begin, _BLOCK):
-            some = min(_BLOCK, end - begin - first)
-            raw = out[begin + first : begin + first + some]
-            _raw_density(features, first, some, (w_in.shape[0], len(w_out)), w_in, w_out, x, hidden, raw)
+        _densities_part(unit[begin:end], net, out[begin:end])
 
 
 def hash_density(unit: Tensor, net: DensityNet) -> Tensor:
@@ -318,7 +333,7 @@ def _network(net: DensityNet) -> tuple[Any, ...]:
 
 
 class Marched(NamedTuple):
-    """Visible samples in ray order, with what marching had to find out about them."""
+    """Visible samples in ray order, with what marching had to find out about them. Valid until the next march."""
 
     t_starts: np.ndarray
     """(S,)"""
@@ -334,11 +349,12 @@ class Marched(NamedTuple):
     """(N + 1,)"""
 
 
-def _room(parts: int, rows: int, features: int) -> tuple[np.ndarray, ...]:
-    pages = [np.empty((parts, rows, *rest), kind) for rest, kind in (
-        ((), np.float32), ((), np.float32), ((), np.int64), ((3,), np.float32), ((features,), np.float32)
-    )]  # fmt: skip
-    return tuple(pages)
+def _room(name: str, parts: int, rows: int, features: int) -> tuple[np.ndarray, ...]:
+    pages = {"t0": (), "t1": (), "owner": (), "unit": (3,), "features": (features,)}
+    return tuple(
+        scratch(f"{name} {page}", (parts, rows, *rest), np.int64 if page == "owner" else np.float32)
+        for page, rest in pages.items()
+    )
 
 
 def marched(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: DensityNet, stop: float) -> Marched:
@@ -351,7 +367,7 @@ def marched(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: Dens
     room = _ROOM * (n // parts + 1)
     found = np.zeros(parts, np.int64)
     while True:
-        arena = _room(parts, room, width)
+        arena = _room("waves", parts, room, width)
         _waves(arrays, place, (array(grid), reach(grid)), lattice, inside, arena, found)
         if found.min() >= 0:
             break
@@ -359,7 +375,7 @@ def marched(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: Dens
     counts = np.zeros(n, np.int64)
     _count(arena[2], found, counts)
     offsets = _offsets(counts)
-    t0, t1, owners, unit, features = (page[0] for page in _room(1, int(offsets[-1]), width))
+    t0, t1, owners, unit, features = (page[0] for page in _room("sorted", 1, int(offsets[-1]), width))
     _sort(arena, found, offsets[:-1].copy(), (t0, t1, owners, unit, features))
     return Marched(t0, t1, owners, unit, features, offsets)
 
@@ -369,4 +385,5 @@ def march_visible(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.march_visible`."""
     found = marched(rays, space, grid, lattice, net, stop)
-    return torch.from_numpy(found.t_starts), torch.from_numpy(found.t_ends), torch.from_numpy(found.offsets)
+    kept = (found.t_starts.copy(), found.t_ends.copy(), found.offsets)
+    return torch.from_numpy(kept[0]), torch.from_numpy(kept[1]), torch.from_numpy(kept[2])

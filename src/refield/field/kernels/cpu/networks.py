@@ -48,7 +48,7 @@ def unpack(sums: tuple[np.ndarray, ...], networks: Networks) -> list[Tensor]:
     return [g[: w.shape[0], : w.shape[1]].contiguous() for g, w in zip(grads, networks)]
 
 
-@njit(inline="always", **JIT)
+@njit(**JIT)
 def room_for(samples, packed):  # type: ignore[no-untyped-def]
     """Scratch for the activations of so many samples, in the order in which they come about."""
     rows = (samples + 7) // 8 * 8
@@ -64,25 +64,13 @@ def room_for(samples, packed):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(inline="always", **JIT)
-def new_sums(packed):  # type: ignore[no-untyped-def]
-    """Zeros in the shape of the five padded matrices."""
-    return (
-        np.zeros(packed[1].shape, np.float32),
-        np.zeros(packed[3].shape, np.float32),
-        np.zeros(packed[5].shape, np.float32),
-        np.zeros(packed[7].shape, np.float32),
-        np.zeros(packed[9].shape, np.float32),
-    )
-
-
-@njit(inline="always", **JIT)
+@njit(forceinline=True, **JIT)
 def _layer(x, w, y, rows, n):  # type: ignore[no-untyped-def]
     """y = x w over the first n columns of x."""
     product(x.ctypes.data, x.shape[1], 1, w.ctypes.data, w.shape[1], y.ctypes.data, y.shape[1], rows, w.shape[1], n)
 
 
-@njit(inline="always", **JIT)
+@njit(forceinline=True, **JIT)
 def _weight_gradient(to_y, x, into, rows):  # type: ignore[no-untyped-def]
     """into += to_y^T x."""
     add_product(
@@ -91,21 +79,21 @@ def _weight_gradient(to_y, x, into, rows):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@njit(inline="never", **JIT)
+@njit(**JIT)
 def _relu(x, rows):  # type: ignore[no-untyped-def]
     flat = x.reshape(-1)
     for i in range(rows * x.shape[1]):
         flat[i] = max(flat[i], _ZERO)
 
 
-@njit(inline="never", **JIT)
+@njit(**JIT)
 def _relu_backward(y, to_y, rows):  # type: ignore[no-untyped-def]
     a, b = y.reshape(-1), to_y.reshape(-1)
     for i in range(rows * y.shape[1]):
         b[i] = b[i] if a[i] > 0 else _ZERO
 
 
-@njit(inline="never", **JIT)
+@njit(**JIT)
 def forward_block(features, directions, sizes, packed, room):  # type: ignore[no-untyped-def]
     """The activations of a block into ``room``: features (n, F), directions (n, 3); sizes (F, D, H).
 
@@ -133,7 +121,7 @@ def forward_block(features, directions, sizes, packed, room):  # type: ignore[no
         flat[i] = _ONE / (_ONE + exp(-flat[i]))
 
 
-@njit(inline="never", **JIT)
+@njit(**JIT)
 def backward_block(to_raw, to_rgb, sizes, packed, room, back, sums, to_features):  # type: ignore[no-untyped-def]
     """Gradients of the block last seen by :func:`forward_block`.
 
@@ -145,7 +133,9 @@ def backward_block(to_raw, to_rgb, sizes, packed, room, back, sums, to_features)
     f, d, _ = sizes
     n = len(to_raw)
     rows = (n + 7) // 8 * 8
-    to_out[:rows] = 0
+    for s in range(rows):
+        for i in range(to_out.shape[1]):
+            to_out[s, i] = 0
     for s in range(n):
         for i in range(3):
             to_out[s, i] = to_rgb[s, i] * rgb[s, i] * (_ONE - rgb[s, i])
@@ -162,7 +152,8 @@ def backward_block(to_raw, to_rgb, sizes, packed, room, back, sums, to_features)
         to_entering.ctypes.data, to_entering.shape[1], rows, wide, c1.shape[1],
     )  # fmt: skip
     for s in range(rows):
-        to_entering[s, d:wide] = 0
+        for i in range(d, wide):
+            to_entering[s, i] = 0
         to_entering[s, 0] = to_raw[s] if s < n else _ZERO
     add_product(
         to_entering.ctypes.data, 1, to_entering.shape[1], hidden.ctypes.data, hidden.shape[1],
@@ -177,29 +168,45 @@ def backward_block(to_raw, to_rgb, sizes, packed, room, back, sums, to_features)
             to_features[s, i] = to_x[s, i]
 
 
+# What a thread does is compiled by itself: numba's analysis of parallel loops is slow, and sees a call only.
+
+
+@njit(**JIT)
+def _forward_part(begin, end, features, directions, sizes, packed, raw, rgb):  # type: ignore[no-untyped-def]
+    room = room_for(BLOCK, packed)
+    for first in range(begin, end, BLOCK):
+        last = min(end, first + BLOCK)
+        forward_block(features[first:last], directions[first:last], sizes, packed, room)
+        for s in range(last - first):
+            raw[first + s] = room[2][s, 0]
+            for i in range(3):
+                rgb[first + s, i] = room[5][s, i]
+
+
 @njit(parallel=True, **JIT)
 def _forward(features, directions, sizes, packed, raw, rgb):  # type: ignore[no-untyped-def]
     n = len(raw)
-    for b in prange((n + BLOCK - 1) // BLOCK):
-        room = room_for(BLOCK, packed)
-        first, last = b * BLOCK, min(n, (b + 1) * BLOCK)
+    for g in prange(_GROUPS):
+        _forward_part(n * g // _GROUPS, n * (g + 1) // _GROUPS, features, directions, sizes, packed, raw, rgb)
+
+
+@njit(**JIT)
+def _backward_part(begin, end, inputs, sizes, packed, to_raw, to_rgb, to_features, sums):  # type: ignore[no-untyped-def]
+    features, directions = inputs
+    room, back = room_for(BLOCK, packed), room_for(BLOCK, packed)
+    for first in range(begin, end, BLOCK):
+        last = min(end, first + BLOCK)
         forward_block(features[first:last], directions[first:last], sizes, packed, room)
-        raw[first:last] = room[2][: last - first, 0]
-        rgb[first:last] = room[5][: last - first, :3]
+        backward_block(to_raw[first:last], to_rgb[first:last], sizes, packed, room, back, sums, to_features[first:last])
 
 
 @njit(parallel=True, **JIT)
-def _backward(features, directions, sizes, packed, to_raw, to_rgb, to_features, all_sums):  # type: ignore[no-untyped-def]
-    n, groups = len(to_raw), all_sums[0].shape[0]
-    for g in prange(groups):
-        room, back = room_for(BLOCK, packed), room_for(BLOCK, packed)
+def _backward(inputs, sizes, packed, to_raw, to_rgb, to_features, all_sums):  # type: ignore[no-untyped-def]
+    n = len(to_raw)
+    for g in prange(_GROUPS):
         sums = (all_sums[0][g], all_sums[1][g], all_sums[2][g], all_sums[3][g], all_sums[4][g])
-        for first in range(n * g // groups, n * (g + 1) // groups, BLOCK):
-            last = min(n * (g + 1) // groups, first + BLOCK)
-            forward_block(features[first:last], directions[first:last], sizes, packed, room)
-            backward_block(
-                to_raw[first:last], to_rgb[first:last], sizes, packed, room, back, sums, to_features[first:last]
-            )
+        begin, end = n * g // _GROUPS, n * (g + 1) // _GROUPS
+        _backward_part(begin, end, inputs, sizes, packed, to_raw, to_rgb, to_features, sums)
 
 
 def sizes_of(networks: Networks) -> tuple[int, int, int]:
@@ -230,7 +237,7 @@ class _HashField(Function):
         packed = pack(networks)
         sums = group_sums(packed)
         to_features = np.empty_like(ctx.features)
-        _backward(ctx.features, array(d), sizes_of(networks), packed, array(to_raw), array(to_rgb), to_features, sums)
+        _backward((ctx.features, array(d)), sizes_of(networks), packed, array(to_raw), array(to_rgb), to_features, sums)
         to_tables = torch.zeros_like(tables)
         encode_backward(array(unit), to_features.view(np.float64), ctx.resolutions, pairs(to_tables))
         return None, None, to_tables, None, *unpack(tuple(s.sum(0) for s in sums), networks)

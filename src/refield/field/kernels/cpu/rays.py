@@ -168,7 +168,7 @@ def contract(x: Tensor, centre: Tensor, radius: float) -> Tensor:
     return out.reshape(x.shape)
 
 
-@njit(inline="always", **JIT)
+@njit(forceinline=True, **JIT)
 def harmonics_of(x, y, z, out):  # type: ignore[no-untyped-def]
     """The 16 harmonics of one direction; all constants are float32, or the loop would run in double precision."""
     f = np.float32

@@ -104,7 +104,7 @@ _wide, _narrow = _tile(ROWS, 2, False), _tile(ROWS, 1, False)
 _wide_more, _narrow_more = _tile(ROWS, 2, True), _tile(ROWS, 1, True)
 
 
-@njit(inline="never", **JIT)
+@njit(**JIT)
 def product(a, a_row, a_k, b, b_k, c, c_row, rows, columns, n):  # type: ignore[no-untyped-def]
     """C = A B for addresses a, b, c and strides in floats; rows and columns must be multiples of 8 and PAD."""
     for column in range(0, columns, 2 * LANES):
@@ -116,7 +116,7 @@ def product(a, a_row, a_k, b, b_k, c, c_row, rows, columns, n):  # type: ignore[
                 _narrow(a + 4 * r * a_row, a_row, a_k, b + 4 * column, b_k, c + 4 * (r * c_row + column), c_row, n)
 
 
-@njit(inline="never", **JIT)
+@njit(**JIT)
 def add_product(a, a_row, a_k, b, b_k, c, c_row, rows, columns, n):  # type: ignore[no-untyped-def]
     """C += A B, as :func:`product`."""
     for column in range(0, columns, 2 * LANES):
@@ -138,7 +138,7 @@ def _make_bits_to_float(typing: Any, bits: Any) -> Any:
 _bits_to_float: Any = intrinsic(_make_bits_to_float)
 
 
-@njit(inline="always", **JIT)
+@njit(forceinline=True, **JIT)
 def exp(x):  # type: ignore[no-untyped-def]
     """e^x in single precision, two units in the last place; unlike libm's, loops over it become vectors."""
     f = np.float32

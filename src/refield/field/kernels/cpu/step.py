@@ -10,7 +10,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from refield.field.kernels.cpu.encoding import array, encode_backward, pairs
+from refield.field.kernels.cpu.encoding import array, encode_backward, pairs, scratch
 from refield.field.kernels.cpu.marching import Marched, marched
 from refield.field.kernels.cpu.networks import (
     BLOCK,
@@ -28,7 +28,7 @@ from refield.field.kernels.reference import Aim, Batch, Lattice, Networks, Space
 _ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
 
 
-@njit(inline="never", **JIT)
+@njit(**JIT)
 def _prepare(first, n, raw, t0, t1, radius, unit, sigma, scratch):  # type: ignore[no-untyped-def]
     """What each sample of a block needs, in straight loops: its density, and five numbers into ``scratch`` (5, n)."""
     clear, mid, length, near, delta = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
@@ -44,7 +44,7 @@ def _prepare(first, n, raw, t0, t1, radius, unit, sigma, scratch):  # type: igno
         clear[k] = exp(-density * (b - a))
 
 
-@njit(inline="never", **JIT)
+@njit(**JIT)
 def _along_ray(first, n, at, rgb, scratch, aim, told, w, sigma, to_raw, to_rgb):  # type: ignore[no-untyped-def]
     """Composite a ray's n samples, compare, and write the gradients of the loss; returns the ray's share of the loss.
 
@@ -92,45 +92,47 @@ def _along_ray(first, n, at, rgb, scratch, aim, told, w, sigma, to_raw, to_rgb):
     return (d0 * d0 + d1 * d1 + d2 * d2) / (_THREE * rays) + strength * spread / rays
 
 
-@njit(parallel=True, **JIT)
-def _through(found, batch, sizes, packed, aim, outs, all_sums, losses):  # type: ignore[no-untyped-def]
-    """Every group: its rays forward and back, some at a time; gradients of the networks into its own sums."""
+@njit(**JIT)
+def _group(begin, end, found, batch, sizes, packed, aim, outs, sums):  # type: ignore[no-untyped-def]
+    """Rays ``begin : end`` forward and back, some at a time; returns their share of the loss."""
     t0, t1, _, _, features, offsets = found
     directions, colours, background = batch
     w, sigma, to_features = outs
-    groups, rays = len(losses), len(offsets) - 1
-    for g in prange(groups):
-        begin = np.searchsorted(offsets, len(t0) * g // groups)
-        end = rays if g == groups - 1 else np.searchsorted(offsets, len(t0) * (g + 1) // groups)
-        longest = BLOCK
-        for r in range(begin, end):
-            longest = max(longest, offsets[r + 1] - offsets[r])
-        room, back = room_for(longest, packed), room_for(longest, packed)
-        d, scratch = np.empty((longest, 3), np.float32), np.empty((5, longest), np.float32)
-        to_raw, to_rgb = np.empty(longest, np.float32), np.empty((longest, 3), np.float32)
-        sums = (all_sums[0][g], all_sums[1][g], all_sums[2][g], all_sums[3][g], all_sums[4][g])
-        loss = 0.0
-        last = int(begin)
-        while last < end:
-            r = last
-            first = offsets[r]
+    longest = BLOCK
+    for r in range(begin, end):
+        longest = max(longest, offsets[r + 1] - offsets[r])
+    room, back = room_for(longest, packed), room_for(longest, packed)
+    d, scratch = np.empty((longest, 3), np.float32), np.empty((5, longest), np.float32)
+    to_raw, to_rgb = np.empty(longest, np.float32), np.empty((longest, 3), np.float32)
+    loss, last = 0.0, begin
+    while last < end:
+        r = last
+        first = offsets[r]
+        last += 1
+        while last < end and offsets[last + 1] - first <= longest:
             last += 1
-            while last < end and offsets[last + 1] - first <= longest:
-                last += 1
-            n = offsets[last] - first
-            for q in range(r, last):
-                for i in range(offsets[q] - first, offsets[q + 1] - first):
-                    d[i] = directions[q]
-            forward_block(features[first : first + n], d[:n], sizes, packed, room)
-            _prepare(first, n, room[2][:, 0], t0, t1, aim[0], aim[2], sigma, scratch)
-            for q in range(r, last):
-                told = (colours[q], background[q])
-                loss += _along_ray(
-                    offsets[q], offsets[q + 1] - offsets[q], offsets[q] - first,
-                    room[5], scratch, aim, told, w, sigma, to_raw, to_rgb,
-                )  # fmt: skip
-            backward_block(to_raw[:n], to_rgb[:n], sizes, packed, room, back, sums, to_features[first : first + n])
-        losses[g] = loss
+        n = offsets[last] - first
+        for q in range(r, last):
+            for i in range(offsets[q] - first, offsets[q + 1] - first):
+                d[i, 0], d[i, 1], d[i, 2] = directions[q, 0], directions[q, 1], directions[q, 2]
+        forward_block(features[first : first + n], d[:n], sizes, packed, room)
+        _prepare(first, n, room[2][:, 0], t0, t1, aim[0], aim[2], sigma, scratch)
+        for q in range(r, last):
+            told = (colours[q], background[q])
+            loss += _along_ray(
+                offsets[q], offsets[q + 1] - offsets[q], offsets[q] - first,
+                room[5], scratch, aim, told, w, sigma, to_raw, to_rgb,
+            )  # fmt: skip
+        backward_block(to_raw[:n], to_rgb[:n], sizes, packed, room, back, sums, to_features[first : first + n])
+    return loss
+
+
+@njit(parallel=True, **JIT)
+def _through(found, batch, sizes, packed, aim, outs, all_sums, bounds, losses):  # type: ignore[no-untyped-def]
+    """Every group of rays; gradients of the networks into its own sums."""
+    for g in prange(len(losses)):
+        sums = (all_sums[0][g], all_sums[1][g], all_sums[2][g], all_sums[3][g], all_sums[4][g])
+        losses[g] = _group(bounds[g], bounds[g + 1], found, batch, sizes, packed, aim, outs, sums)
 
 
 def train_step(
@@ -150,11 +152,13 @@ def train_step(
     packed = pack(networks)
     sums = group_sums(packed)
     w, sigmas, losses = torch.empty(n), torch.empty(n), np.zeros(sums[0].shape[0])
-    to_features = np.empty_like(found.features)
+    to_features = scratch("to features", found.features.shape)
     told = (array(batch.rays[1]), array(batch.colours), array(batch.background))
     numbers = tuple(np.float32(x) for x in (space[1], aim.distortion, aim.gradient_unit, rays))
     outs = (w.numpy(), sigmas.numpy(), to_features)
-    _through(tuple(found), told, sizes_of(networks), packed, numbers, outs, sums, losses)
+    bounds = np.searchsorted(found.offsets, n * np.arange(len(losses) + 1) // len(losses))
+    bounds[-1] = rays  # those without a sample, too
+    _through(tuple(found), told, sizes_of(networks), packed, numbers, outs, sums, bounds, losses)
     encode_backward(found.unit, to_features.view(np.float64), np.asarray(resolutions, np.int32), pairs(into[0]))
     for total, grad in zip(into[1:], unpack(tuple(s.sum(0) for s in sums), networks)):
         total += grad
