@@ -51,7 +51,8 @@ def train(data: Path, work: Path, clock: Clock, config: FitConfig, *, overwrite:
     _check_cameras(data, capture)
     with Workspace.building(work, overwrite=overwrite, made_by=made_by) as workspace:
         capture = workspace.keep_capture(capture)
-        clock.stage(f"fit a field to {len(capture.train)} photos (memory: {needed})")
+        clock.stage(f"fit a field to {len(capture.train)} photos")
+        clock.console.print(f"           memory: {needed}", markup=False)
         try:
             with clock.training("fit") as line:
                 fitted = fit_field(capture, config, line)

@@ -148,6 +148,20 @@ def train_step(
     tables, resolutions, networks = field
     net = (tables, resolutions, networks[0], networks[1][0])
     found = marched(batch.rays, space, grid, lattice, net, aim.stop)
+    return after_march(found, batch, space, grid.shape[0], field, aim, into)
+
+
+def after_march(
+    found: Marched,
+    batch: Batch,
+    space: Space,
+    resolution: int,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    aim: Aim,
+    into: list[Tensor],
+) -> Stepped:
+    """The rest of the step, for the samples that marching found; ``resolution``: cells a side of the grid."""
+    _, resolutions, networks = field
     n, rays = len(found.t_starts), len(batch.colours)
     packed = pack(networks)
     sums = group_sums(packed)
@@ -162,7 +176,7 @@ def train_step(
     encode_backward(found.unit, to_features.view(np.float64), np.asarray(resolutions, np.int32), pairs(into[0]))
     for total, grad in zip(into[1:], unpack(tuple(s.sum(0) for s in sums), networks)):
         total += grad
-    return Stepped(float(losses.sum()), _cells(found, grid.shape[0]), w, sigmas, rays)
+    return Stepped(float(losses.sum()), _cells(found, resolution), w, sigmas, rays)
 
 
 def _cells(found: Marched, r: int) -> Tensor:
