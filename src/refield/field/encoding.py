@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -40,12 +41,17 @@ class HashGrid(nn.Module):
         super().__init__()
         self.resolutions = resolutions
         self.width = 2 * len(resolutions)
-        table = torch.rand(len(resolutions), table_size, 2, generator=generator)
-        self.tables = nn.Parameter((table * 2 - 1) * 1e-4)
+        table = large_zeros(len(resolutions), table_size, 2)
+        self.tables = nn.Parameter(table.uniform_(-1e-4, 1e-4, generator=generator))
 
     def forward(self, y: Tensor) -> Tensor:
         """Contracted (S, 3) -> features (S, width)."""
         return kernels.hash_encode((y + 2) / 4, self.tables, self.resolutions)
+
+
+def large_zeros(*shape: int) -> Tensor:
+    """Zeros, float32. Numpy asks Linux for large pages, torch does not: random reads of a table miss the TLB less."""
+    return torch.from_numpy(np.zeros(shape, np.float32))
 
 
 def geometric_levels(coarsest: int, finest: int, count: int) -> tuple[int, ...]:

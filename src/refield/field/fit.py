@@ -13,7 +13,7 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.coverage import knowable
-from refield.field.encoding import Contraction
+from refield.field.encoding import Contraction, large_zeros
 from refield.field.kernels.reference import Aim, Batch
 from refield.field.occupancy import OccupancyTrainer
 from refield.field.pixels import PixelBank
@@ -171,9 +171,9 @@ class TableAdam:
 
     def __init__(self, model: HashField) -> None:
         self.parameters = [model.encoding.tables, *model.networks]
-        self.grads = [torch.zeros_like(p) for p in self.parameters]
+        self.grads = [large_zeros(*p.shape) for p in self.parameters]
         """where a step's gradients are added up; cleared by :meth:`step`"""
-        self.first, self.second = ([torch.zeros_like(p) for p in self.parameters] for _ in range(2))
+        self.first, self.second = ([large_zeros(*p.shape) for p in self.parameters] for _ in range(2))
         self.count = 0
         self.skipped, self.in_a_row = 0, 0
         """steps that were left out: all of them, and since the last that was not"""

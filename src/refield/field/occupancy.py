@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from refield.field import kernels
+from refield.field.encoding import large_zeros
 from refield.field.pixels import PixelBank
 from refield.field.radiance import HashField
 from refield.field.render import CHUNK
@@ -40,7 +41,7 @@ class OccupancyTrainer:
         self.allowed = torch.ones(cells, dtype=torch.bool, device=device) if allowed is None else allowed
         self.rounds = 1  # renewals of the grid, from 1
         self.open = self.allowed.nonzero()[:, 0]
-        self.state = torch.zeros(cells, 4, device=device)
+        self.state = large_zeros(cells, 4).to(device)
         """see `kernels.reference.observe`"""
         self.state[:, 1] = 16 * _WEIGHT  # the benefit of the doubt
         for some in torch.arange(cells, device=device).split(1 << 20):

@@ -176,9 +176,14 @@ def after_march(
     encode_backward(found.unit, to_features.view(np.float64), np.asarray(resolutions, np.int32), pairs(into[0]))
     for total, grad in zip(into[1:], unpack(tuple(s.sum(0) for s in sums), networks)):
         total += grad
-    return Stepped(float(losses.sum()), _cells(found, resolution), w, sigmas, rays)
+    cells = torch.empty(n, dtype=torch.int64)
+    _find_cells(found.unit, resolution, cells.numpy())
+    return Stepped(float(losses.sum()), cells, w, sigmas, rays)
 
 
-def _cells(found: Marched, r: int) -> Tensor:
-    ijk = np.minimum((found.unit * np.float32(r)).astype(np.int64), r - 1)
-    return torch.from_numpy((ijk[:, 0] * r + ijk[:, 1]) * r + ijk[:, 2])
+@njit(parallel=True, **JIT)
+def _find_cells(unit, r, out):  # type: ignore[no-untyped-def]
+    for s in prange(len(out)):
+        i, j, k = int(unit[s, 0] * r), int(unit[s, 1] * r), int(unit[s, 2] * r)
+        i, j, k = min(i, r - 1), min(j, r - 1), min(k, r - 1)
+        out[s] = (i * r + j) * r + k
