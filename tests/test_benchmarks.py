@@ -1,4 +1,4 @@
-"""What the benchmarks say where they cannot run."""
+"""The benchmark scripts run, or say why not."""
 
 import subprocess
 import sys
@@ -19,3 +19,13 @@ def test_gpu_script_says_without_a_gpu(tmp_path: Path) -> None:
     assert (said.returncode, said.stdout) == (2, "")
     assert said.stderr.count("\n") == 1 and "needs an NVIDIA GPU" in said.stderr and "--dry-run" in said.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_engine_script_makes_its_table(tmp_path: Path) -> None:
+    out = tmp_path / "engine.md"
+    command = [sys.executable, str(ROOT / "benchmarks" / "engine.py"), "--quick", "--only", "cost", "--out", str(out)]
+    subprocess.run(command, env=HERE, cwd=tmp_path, capture_output=True, check=True, timeout=300)
+    row = next(line for line in out.read_text(encoding="utf-8").splitlines() if "20 of 32²" in line)
+    ms, samples, _, stated, peak, psnr = (float(cell) for cell in row.split("|")[3:9])
+    assert ms > 0 and samples > 1 and psnr > 5
+    assert 0.2 * stated < peak < 20 * stated

@@ -15,7 +15,7 @@ _ROOM = 40  # samples a ray that the march makes room for, with what growing buf
 
 @dataclass(frozen=True)
 class Memory:
-    """Bytes, beside what the program itself takes (about 0.4 GB)."""
+    """Bytes, beside what the program with its compiled kernels takes (about 0.5 GB)."""
 
     photos: int
     """pixels that are kept, uint8"""
