@@ -177,8 +177,13 @@ def test_ctrl_c_leaves_no_workspace(place, monkeypatch, capsys):
 def test_a_fit_that_breaks_down_keeps_its_last_good_state_and_says_so(place, monkeypatch, capsys):
     from refield.field import kernels
 
-    whole = kernels.train_step
-    monkeypatch.setattr(kernels, "train_step", lambda *args: whole(*args)._replace(loss=float("nan")))
+    whole, steps = kernels.train_step, []
+
+    def step(*args):
+        steps.append(whole(*args))
+        return steps[-1] if len(steps) < 20 else steps[-1]._replace(loss=float("nan"))
+
+    monkeypatch.setattr(kernels, "train_step", step)
     assert main(["train", "data", "out", *TINY_FIT]) == 0
     assert "the last good state is kept" in " ".join(capsys.readouterr().err.split())
     assert (place / "out/field/field.safetensors").is_file()

@@ -166,8 +166,10 @@ def broken(monkeypatch: pytest.MonkeyPatch, bad: Callable[[int], bool], gradient
         steps.append(len(steps))
         if not bad(steps[-1]):
             return done
-        args[-1][3][0, 0] = math.nan
-        return done if gradient else done._replace(loss=math.nan)
+        if gradient:
+            args[-1][3][0, 0] = math.nan
+            return done
+        return done._replace(loss=math.nan)
 
     monkeypatch.setattr(kernels, "train_step", step)
     return steps

@@ -246,6 +246,23 @@ def test_hash_density_is_the_field_s() -> None:
             close(twin.hash_density(unit, net), raw)
 
 
+def test_what_is_not_a_number_or_has_no_direction_breaks_nothing() -> None:
+    tables = torch.randn(2, 1 << 12, 2)
+    unit = torch.rand(70, 3)
+    unit[3, 1] = torch.nan
+    features = cpu.hash_encode(unit, tables.requires_grad_(), (8, 64))
+    assert features[3].isnan().all() and features[:3].isfinite().all()
+    features[4:].sum().backward()
+    assert tables.grad is not None  # its own rows show it, no others
+    assert 0 < (~tables.grad.isfinite()).sum() <= 2 * 2 * 8
+    rays = (torch.tensor([[2.5, 0, 0], [0, 0, 0]]), torch.zeros(2, 3), torch.zeros(2))
+    grid = torch.zeros(16, 16, 16, dtype=torch.uint8)
+    assert len(cpu.march(rays, (torch.zeros(3), 1.0), grid, (0.0, 50.0, 0.05))[0]) == 0
+    with torch.inference_mode():
+        seen = torch.ones(16, 16, 16, dtype=torch.uint8)
+        assert len(cpu.march(rays, (torch.zeros(3), 1.0), seen, (0.0, 1.0, 0.5))[0]) > 0
+
+
 def test_what_cells_are_known_to_hold() -> None:
     torch.manual_seed(11)
     states = []

@@ -57,7 +57,7 @@ def train(data: Path, work: Path, clock: Clock, config: FitConfig, *, overwrite:
             with clock.training("fit") as line:
                 fitted = fit_field(capture, config, line)
         except NonFiniteError as error:
-            if error.field is None:
+            if error.field is None or error.steps == 0:
                 raise
             fitted = error.field
             clock.warn(f"{error}; the last good state is kept, look at it before you use it")

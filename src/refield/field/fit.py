@@ -78,6 +78,8 @@ class NonFiniteError(RuntimeError):
 
     field: HashField | None = None
     """the last good state, ready for use, where :func:`fit_field` raises this"""
+    steps: int = 0
+    """that were taken before"""
 
 
 ProgressCallback = Callable[[FitProgress], None]
@@ -196,7 +198,9 @@ class TableAdam:
             for grad in self.grads:
                 grad.zero_()
             if self.in_a_row >= MOST_SKIPPED:
-                raise NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
+                error = NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
+                error.steps = self.count
+                raise error
             return False
         self.count, self.in_a_row = self.count + 1, 0
         with torch.no_grad():
@@ -267,8 +271,8 @@ class _Fit:
         aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
         done = kernels.train_step(batch, space, sampler.grid, sampler.lattice, field, aim, self.adam.grads)
-        self.adam.step(self.config.rate * rate_factor(progress), done.loss)
-        self.occupancy.observe(step, done.cells, done.weights, done.sigmas)
+        if self.adam.step(self.config.rate * rate_factor(progress), done.loss):
+            self.occupancy.observe(step, done.cells, done.weights, done.sigmas)
         self._resize(n, len(done.weights))
 
     def _resize(self, rays: int, samples: int) -> None:

@@ -64,9 +64,12 @@ class OccupancyTrainer:
 
     def renew(self, step: int) -> None:
         """Look into some cells at random, and choose anew which are shown."""
+        if len(self.open) == 0:
+            return
         part = _PROBED_AT_FIRST if step < 4 * EVERY else _PROBED
-        cells = self.open[torch.randint(len(self.open), (len(self.open) // part,), device=self.open.device)]
-        self.state[cells, 0] = torch.maximum(self.state[cells, 0] * DECAY, self._probe(cells))
+        cells = self.open[torch.randint(len(self.open), (len(self.open) // part + 1,), device=self.open.device)]
+        self.state[cells, 0] = self.state[cells, 0] * DECAY  # cells may be drawn twice
+        kernels.scatter_max(self._probe(cells), cells, self.state[:, 0])
         if step >= self.cull_from:
             # a few hidden cells get another chance, since geometry still changes
             again = self.open[torch.randint(len(self.open), (len(self.open) // 100,), device=self.open.device)]

@@ -89,7 +89,9 @@ class HashField(nn.Module):
     def density(self, x: Tensor) -> Tensor:
         """World points (..., 3) -> sigma (...,), per world unit."""
         flat = x.reshape(-1, 3)
-        if torch.is_grad_enabled() and (flat.requires_grad or self.density_in.requires_grad):
+        if torch.is_grad_enabled() and (
+            flat.requires_grad or any(p.requires_grad for p in self.density_net if isinstance(p, Tensor))
+        ):
             raw = functional.linear(self._hidden(flat), self.density_out[:1])[:, 0]
         else:
             raw = kernels.hash_density(self._unit(flat), self.density_net)

@@ -62,7 +62,8 @@ class HelperTraining:
 
         The state that showed the held-out pixels best is kept: few photos are soon learnt by heart.
         """
-        began, looks, c = time.perf_counter(), [], self.config
+        looks: list[float] = []
+        began, c = time.perf_counter(), self.config
         best: dict[str, Tensor] = {}
         for step in range(c.steps):
             progress = max(step / c.steps, (time.perf_counter() - began) / c.max_seconds)
@@ -73,6 +74,8 @@ class HelperTraining:
             try:
                 self._step(step, c.rate * rate_factor(progress))
             except NonFiniteError as error:
+                if not looks:  # it broke down before there was anything worth keeping
+                    raise
                 self.why_stopped = str(error)
                 break
             self.steps_done = step + 1
@@ -150,7 +153,8 @@ class HelperTraining:
         cells = self.helper.sampler.cells(x)
         loss = loss + self.config.emptiness * (own * self.empty[cells]).sum() / len(rays)
         self.adam.backward(loss)
-        self.adam.step(rate, float(loss.detach()))
+        if not self.adam.step(rate, float(loss.detach())):
+            return
         self.occupancy.observe(step, cells, own.detach(), sigmas.detach())
         per_ray = max(len(x) / len(rays), 0.5)
         self.rays_per_step = int(min(max(self.config.samples / per_ray, 1024), 8192))

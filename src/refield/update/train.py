@@ -49,7 +49,8 @@ def update_field(
     are cut out and the moved ones moved. ``on_stage`` hears the name of each stage as it begins.
 
     Raises:
-        NonFiniteError: the helper's loss was not finite for 20 steps in a row.
+        NonFiniteError: the helper's loss was not finite for 20 steps in a row before its first look; after one, the
+            best state is kept and ``why_stopped`` says so.
     """
     say = on_stage or (lambda name: None)
     torch.manual_seed(config.seed)

@@ -77,23 +77,26 @@ def _weights(fx, fy, fz, wts, s):  # type: ignore[no-untyped-def]
 
 @njit(forceinline=True, **JIT)
 def corners(unit, first, n, resolution, size, rows, wts):  # type: ignore[no-untyped-def]
-    """Table rows (8, n) and trilinear weights (8, n) around unit positions ``first : first + n``."""
+    """Table rows (8, n) and trilinear weights (8, n) around unit positions ``first : first + n``.
+
+    The bound comes first in ``max``: of a NaN that makes row 0 and a NaN weight, not an address.
+    """
     res, top = np.float32(resolution), np.float32(resolution - 1)
     side, mask = np.uint32(resolution + 1), np.uint32(size - 1)
     if (resolution + 1) ** 3 <= size:  # two loops, so that each is a straight run of vectors
         for s in range(n):
             px, py, pz = unit[first + s, 0] * res, unit[first + s, 1] * res, unit[first + s, 2] * res
-            i = np.int32(min(max(px, _ZERO), top))
-            j = np.int32(min(max(py, _ZERO), top))
-            k = np.int32(min(max(pz, _ZERO), top))
+            i = np.int32(min(max(_ZERO, px), top))
+            j = np.int32(min(max(_ZERO, py), top))
+            k = np.int32(min(max(_ZERO, pz), top))
             _weights(px - np.float32(i), py - np.float32(j), pz - np.float32(k), wts, s)
             _dense_rows(np.uint32(i), np.uint32(j), np.uint32(k), side, rows, s)
     else:
         for s in range(n):
             px, py, pz = unit[first + s, 0] * res, unit[first + s, 1] * res, unit[first + s, 2] * res
-            i = np.int32(min(max(px, _ZERO), top))
-            j = np.int32(min(max(py, _ZERO), top))
-            k = np.int32(min(max(pz, _ZERO), top))
+            i = np.int32(min(max(_ZERO, px), top))
+            j = np.int32(min(max(_ZERO, py), top))
+            k = np.int32(min(max(_ZERO, pz), top))
             _weights(px - np.float32(i), py - np.float32(j), pz - np.float32(k), wts, s)
             _hashed_rows(np.uint32(i), np.uint32(j), np.uint32(k), mask, rows, s)
 
@@ -155,9 +158,9 @@ def _encode_slope(unit, tables, resolutions, grad, out):  # type: ignore[no-unty
                 for c in range(8):
                     v[c] = g0 * tables[level, rows[c, s], 0] + g1 * tables[level, rows[c, s], 1]
                 px, py, pz = unit[first + s, 0] * res, unit[first + s, 1] * res, unit[first + s, 2] * res
-                fx = px - np.float32(np.int32(min(max(px, _ZERO), res - _ONE)))
-                fy = py - np.float32(np.int32(min(max(py, _ZERO), res - _ONE)))
-                fz = pz - np.float32(np.int32(min(max(pz, _ZERO), res - _ONE)))
+                fx = px - np.float32(np.int32(min(max(_ZERO, px), res - _ONE)))
+                fy = py - np.float32(np.int32(min(max(_ZERO, py), res - _ONE)))
+                fz = pz - np.float32(np.int32(min(max(_ZERO, pz), res - _ONE)))
                 gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
                 out[first + s, 0] += res * (
                     gy * (gz * (v[4] - v[0]) + fz * (v[5] - v[1])) + fy * (gz * (v[6] - v[2]) + fz * (v[7] - v[3]))
@@ -188,7 +191,7 @@ class _HashEncode(Function):
             to_unit = torch.empty_like(unit)
             _encode_slope(array(unit), array(tables), ctx.resolutions, array(grad), to_unit.numpy())
         if ctx.needs_input_grad[1]:
-            to_tables = torch.zeros_like(tables)
+            to_tables = torch.zeros(tables.shape)
             encode_backward(array(unit), array(grad).view(np.float64), ctx.resolutions, pairs(to_tables))
         return to_unit, to_tables, None
 

@@ -49,6 +49,8 @@ _reaches: list[tuple[Any, int, np.ndarray]] = []
 
 def reach(grid: Tensor) -> np.ndarray:
     """How far rays may go without a look at the grid; kept while the grid lives and is not written to."""
+    if grid.is_inference():  # does not say when it is written to
+        return _reach(array(grid))
     for known, version, found in _reaches:
         if known() is grid and version == grid._version:
             return found
@@ -107,7 +109,7 @@ def _next(ray, t, far, step, grid, reaches, unit):  # type: ignore[no-untyped-de
         elif empty > 1:
             # outside the core the lattice has to be walked, but without a look at the grid; the contraction lengthens
             # nothing by more than 4/3
-            safe = t + np.float32(empty - 1) * np.float32(0.75 * _BLOCKS) / per_unit * ray[9]
+            safe = min(t + np.float32(empty - 1) * np.float32(0.75 * _BLOCKS) / per_unit * ray[9], far)
             t += dt
             while t < safe:
                 m = max(abs(u0 + v0 * t), max(abs(u1 + v1 * t), abs(u2 + v2 * t)))
@@ -127,7 +129,7 @@ def _start(rays, space, lattice, per_unit, r, ray):  # type: ignore[no-untyped-d
     Origin (3), direction (3), its inverse in cells (3), the inverse of its fastest component, and of the step.
     """
     origins, directions, jitter = rays
-    fastest = _ZERO
+    fastest = np.float32(1e-9)
     for a in range(3):
         ray[a] = (origins[r, a] - space[0][a]) / space[1]
         v = directions[r, a] / space[1]

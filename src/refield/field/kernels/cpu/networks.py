@@ -238,7 +238,7 @@ class _HashField(Function):
         sums = group_sums(packed)
         to_features = np.empty_like(ctx.features)
         _backward((ctx.features, array(d)), sizes_of(networks), packed, array(to_raw), array(to_rgb), to_features, sums)
-        to_tables = torch.zeros_like(tables)
+        to_tables = torch.zeros(tables.shape)
         encode_backward(array(unit), to_features.view(np.float64), ctx.resolutions, pairs(to_tables))
         return None, None, to_tables, None, *unpack(tuple(s.sum(0) for s in sums), networks)
 

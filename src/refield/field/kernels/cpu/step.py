@@ -185,5 +185,5 @@ def after_march(
 def _find_cells(unit, r, out):  # type: ignore[no-untyped-def]
     for s in prange(len(out)):
         i, j, k = int(unit[s, 0] * r), int(unit[s, 1] * r), int(unit[s, 2] * r)
-        i, j, k = min(i, r - 1), min(j, r - 1), min(k, r - 1)
+        i, j, k = max(min(i, r - 1), 0), max(min(j, r - 1), 0), max(min(k, r - 1), 0)
         out[s] = (i * r + j) * r + k
