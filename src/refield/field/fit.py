@@ -177,8 +177,8 @@ class TableAdam:
         """where a step's gradients are added up; cleared by :meth:`step`"""
         self.first, self.second = ([large_zeros(*p.shape) for p in self.parameters] for _ in range(2))
         self.count = 0
-        self.skipped, self.in_a_row = 0, 0
-        """steps that were left out: all of them, and since the last that was not"""
+        self.left_out = 0
+        """steps since the last that was taken"""
 
     def backward(self, loss: Tensor) -> None:
         """Add a loss' gradients, by autograd."""
@@ -194,15 +194,15 @@ class TableAdam:
         """
         # a gradient that is not finite shows in the networks', through which all of it has gone
         if not math.isfinite(loss) or not all(bool(g.isfinite().all()) for g in self.grads[1:]):
-            self.skipped, self.in_a_row = self.skipped + 1, self.in_a_row + 1
+            self.left_out += 1
             for grad in self.grads:
                 grad.zero_()
-            if self.in_a_row >= MOST_SKIPPED:
+            if self.left_out >= MOST_SKIPPED:
                 error = NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
                 error.steps = self.count
                 raise error
             return False
-        self.count, self.in_a_row = self.count + 1, 0
+        self.count, self.left_out = self.count + 1, 0
         with torch.no_grad():
             for p, grad, first, second in zip(self.parameters, self.grads, self.first, self.second):
                 kernels.adam(p, grad, first, second, rate, self.count)
@@ -244,21 +244,15 @@ class _Fit:
     def _steps(self) -> None:
         looks: list[float] = []
         for step in range(self.config.steps):
-            progress = self._progress(step)
+            progress = progress_of(self.config, step, self.began)
             if progress >= 1:
                 break
             self._step(step, progress)
             self.steps_done = step + 1
             if (step + 1) % self.config.check_every == 0:
                 looks.append(self._look(step + 1))
-                if self._plateau(looks):
+                if at_plateau(looks, self.config):
                     break
-
-    def _progress(self, step: int) -> float:
-        by_time = 0.0
-        if self.config.max_seconds:
-            by_time = (time.perf_counter() - self.began) / self.config.max_seconds
-        return max(step / self.config.steps, by_time)
 
     def _step(self, step: int, progress: float) -> None:
         n = self.rays_per_step
@@ -297,7 +291,7 @@ class _Fit:
         self.model.train()
         if self.on_progress:
             seconds = time.perf_counter() - self.began
-            left = seconds * (1 / max(self._progress(step), 1e-6) - 1)
+            left = seconds * (1 / max(progress_of(self.config, step, self.began), 1e-6) - 1)
             self.on_progress(
                 FitProgress(
                     step,
@@ -311,9 +305,17 @@ class _Fit:
             )
         return psnr
 
-    def _plateau(self, looks: list[float]) -> bool:
-        n = self.config.patience
-        return len(looks) > n and max(looks[-n:]) < max(looks[:-n]) + self.config.least_gain
+
+def progress_of(config: FitConfig, step: int, began: float) -> float:
+    """How far a fit is, 1 at its end: by its steps or by its seconds since ``began``, whichever is further on."""
+    by_time = (time.perf_counter() - began) / config.max_seconds if config.max_seconds else 0.0
+    return max(step / config.steps, by_time)
+
+
+def at_plateau(looks: list[float], config: FitConfig) -> bool:
+    """Whether the last looks at the held-out pixels, dB, have gained nothing."""
+    n = config.patience
+    return len(looks) > n and max(looks[-n:]) < max(looks[:-n]) + config.least_gain
 
 
 def rate_factor(progress: float) -> float:

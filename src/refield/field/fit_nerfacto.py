@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from refield.field import kernels
-from refield.field.fit import FitProgress, HeldOut, NonFiniteError, ProgressCallback, place_contraction
+from refield.field.fit import MOST_SKIPPED, FitProgress, HeldOut, NonFiniteError, ProgressCallback, place_contraction
 from refield.field.interlevel import interlevel_loss
 from refield.field.losses import colour_loss, scale_gradients
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, looking_everywhere
@@ -19,8 +19,6 @@ from refield.field.pixels import PixelBank
 from refield.field.proposal import Histogram, annealing
 from refield.field.volrend import Samples, accumulate_rgb, weights
 from refield.scene.capture import Capture, Rays
-
-_BAD_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ class _NerfactoFit:
         self.adam = torch.optim.Adam(model.parameters(), lr=config.rate, eps=1e-15, fused=True)
         self.began = time.perf_counter()
         self.done, self.looked = 0, -1
-        self.bad, self.skipped = 0, 0
+        self.bad = 0
         self.proposed = -config.proposal_every
         """the last step at which the proposals learnt"""
 
@@ -115,9 +113,9 @@ class _NerfactoFit:
         learning = step - self.proposed >= proposal_interval(step, self.config)
         loss = self._loss(self.pixels.rays(chosen), self.pixels.colours(chosen), step, learning)
         if not math.isfinite(loss.item()):
-            self.bad, self.skipped = self.bad + 1, self.skipped + 1
-            if self.bad >= _BAD_STEPS:
-                raise NonFiniteError(f"the loss was not finite for {_BAD_STEPS} steps in a row")
+            self.bad += 1
+            if self.bad >= MOST_SKIPPED:
+                raise NonFiniteError(f"the loss was not finite for {MOST_SKIPPED} steps in a row")
             return
         self.bad = 0
         if learning:

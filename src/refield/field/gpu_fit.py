@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import replace
 
@@ -18,7 +17,9 @@ from refield.field.fit import (
     HeldOut,
     NonFiniteError,
     ProgressCallback,
+    at_plateau,
     most_pixels,
+    progress_of,
     rate_factor,
 )
 from refield.field.graphed import Descent, DevicePixels, GraphedStep
@@ -107,7 +108,7 @@ class _GpuFit:
         looks: list[float] = []
         due = self.config.check_every
         graph, step = self._captured(0)
-        while self._progress(step) < 1:
+        while progress_of(self.config, step, self.began) < 1:
             step = self._round(graph, step)
             self.step, samples = step, int(graph.samples)
             if int(self.descent.bad) >= MOST_SKIPPED:
@@ -115,7 +116,7 @@ class _GpuFit:
             if step >= due:
                 due += self.config.check_every
                 looks.append(self._look(step, samples / self.rays_per_step))
-                if self._plateau(looks):
+                if at_plateau(looks, self.config):
                     break
             if self._resized(samples):
                 graph, step = self._captured(step)
@@ -147,7 +148,7 @@ class _GpuFit:
         return graph, step + graph.capture()
 
     def _set_rate(self, step: int) -> None:
-        self.descent.rate.fill_(self.config.rate * rate_factor(self._progress(step)))
+        self.descent.rate.fill_(self.config.rate * rate_factor(progress_of(self.config, step, self.began)))
 
     def _resized(self, samples: int) -> bool:
         """Choose the rays of a step and the lattice anew, after a step with so many samples; whether either changed."""
@@ -165,23 +166,12 @@ class _GpuFit:
             self.rays_per_step = wanted
         return (self.rays_per_step, self.coarseness) != (rays, coarseness)
 
-    def _progress(self, step: int) -> float:
-        by_time = 0.0
-        if self.config.max_seconds:
-            by_time = (time.perf_counter() - self.began) / self.config.max_seconds
-        return max(step / self.config.steps, by_time)
-
     def _look(self, step: int, samples_per_ray: float) -> float:
         psnr = self.judge.psnr(self.model)
         self.model.train()
         if self.on_progress:
             seconds = time.perf_counter() - self.began
-            left = max(seconds * (1 / max(self._progress(step), 1e-6) - 1), 0.0)
+            left = max(seconds * (1 / max(progress_of(self.config, step, self.began), 1e-6) - 1), 0.0)
             speed = self.rays_done / seconds
             self.on_progress(FitProgress(step, self.config.steps, psnr, speed, samples_per_ray, seconds, left))
         return psnr
-
-    def _plateau(self, looks: list[float]) -> bool:
-        n = self.config.patience
-        worth = [x for x in looks if not math.isnan(x)]
-        return len(worth) > n and max(worth[-n:]) < max(worth[:-n]) + self.config.least_gain

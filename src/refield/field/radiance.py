@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -18,11 +15,9 @@ from refield.field.encoding import Contraction, HashGrid, geometric_levels
 from refield.field.kernels.reference import DensityNet, Networks, truncated_exp
 from refield.field.networks import weight
 from refield.field.sampling import OccupancySampler
+from refield.field.stored import State, read_field, sampler_from, state_of, write_field
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
-from refield.scene.errors import InputError
-
-FORMAT = 1
 
 
 @runtime_checkable
@@ -133,45 +128,27 @@ class HashField(nn.Module):
             return sigma
         return torch.where(self.sampler.occupied(x.detach()), sigma, torch.zeros_like(sigma))
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def state(self) -> State:
         """Everything needed to rebuild the field: named tensors, and facts that JSON can hold."""
-        s = self.sampler
-        tensors = {k: v.detach().contiguous() for k, v in self.state_dict().items()}
-        tensors["occupancy"] = s.grid.contiguous()
-        facts = {
-            "architecture": "HashField",
-            "config": asdict(self.config),
-            "contraction": {"centre": s.contraction.centre.tolist(), "radius": s.contraction.radius},
-            "sampler": {"step": s.step, "near": s.near, "far": s.far},
-        }
-        return tensors, facts
+        return state_of(self, self.config, self.sampler)
 
     @staticmethod
     def from_state(tensors: dict[str, Tensor], facts: dict[str, Any]) -> HashField:
         """Inverse of :meth:`state`. Raises KeyError or RuntimeError if something is missing or of another shape."""
         tensors = dict(tensors)
-        space = Contraction(torch.tensor(facts["contraction"]["centre"]), facts["contraction"]["radius"])
-        sampler = OccupancySampler(space, tensors.pop("occupancy"), **facts["sampler"])
+        sampler = sampler_from(tensors, facts)
         field = HashField(HashFieldConfig(**facts["config"]), sampler)
         field.load_state_dict(tensors)
         return field.eval().requires_grad_(False)
 
     def save(self, folder: Path) -> None:
         """Write ``field.safetensors`` and ``field.json`` into an existing folder."""
-        tensors, facts = self.state()
-        save_file(tensors, str(folder / "field.safetensors"))
-        (folder / "field.json").write_text(json.dumps({"format": FORMAT, **facts}, indent=1) + "\n")
+        write_field(folder, self.state())
 
     @staticmethod
     def load(folder: Path) -> HashField:
         """Inverse of :meth:`save`. Raises InputError naming the file that is missing or not ours."""
-        try:
-            facts = json.loads((folder / "field.json").read_text())
-            if facts.get("format") != FORMAT:
-                raise ValueError(f"format {facts.get('format')!r} is not {FORMAT}")
-            return HashField.from_state(load_file(str(folder / "field.safetensors")), facts)
-        except (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
-            raise InputError(folder, f"holds no readable field ({error})", "train it again") from error
+        return read_field(folder, "HashField", HashField.from_state)
 
     def looking_where(self, grid: Tensor) -> None:
         """Replace the occupancy grid (R, R, R) uint8."""
