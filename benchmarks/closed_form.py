@@ -20,7 +20,8 @@ from refield.scene.capture import Capture, Frame
 from refield.scene.pose import invert, rotate, transform
 from refield.scene.transforms_json import load_transforms, save_transforms
 from refield.synthetic.cameras import hemisphere, square_camera
-from refield.synthetic.worlds import WORLDS, State
+from refield.synthetic.state import State
+from refield.synthetic.worlds import WORLDS
 
 _WITHIN = ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25))  # a pixel's rays, from its centre
 

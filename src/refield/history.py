@@ -16,6 +16,7 @@ from refield.artefacts import TENSORS
 from refield.field.radiance import Field
 from refield.field.render import render_camera, render_many
 from refield.scene.capture import Capture, Frame, camera_rays
+from refield.scene.change import OccupancyGrid
 from refield.scene.images import frame_image, write_image
 from refield.update.store import load_updated
 from refield.workspace import Workspace
@@ -40,6 +41,18 @@ def state(workspace: Workspace, visit: int) -> Field:
     for number in changed_visits(workspace, visit):
         field = load_updated(workspace.visit(number), field, workspace.change(number))
     return field
+
+
+def known_objects(workspace: Workspace, visit: int) -> list[OccupancyGrid]:
+    """What earlier visits found out about things that can move, where each stands after ``visit``."""
+    known: list[OccupancyGrid] = []
+    for number in changed_visits(workspace, visit):
+        for o in workspace.change(number).objects:
+            centre = o.grid.tight_aabb().mean(0)
+            known = [k for k in known if not bool(k.contains(centre))]
+            if o.grid_now is not None:
+                known.append(o.grid_now)
+    return known
 
 
 def retouched(capture: Capture, before: Field, now: Field, folder: Path) -> Capture:

@@ -10,15 +10,17 @@ import torch
 from refield.estimate import recipe
 from refield.estimate.alone import object_alone
 from refield.estimate.faces import changed_parts
+from refield.estimate.layers import Sight, layers
 from refield.estimate.matched import camera_from_object, matched_poses
+from refield.estimate.models import Models
 from refield.estimate.past import changed_share, gone_score, look_past
-from refield.estimate.pose_change import RefineConfig, refine, refiner
+from refield.estimate.pose_change import RefineConfig, refine, residuals
 from refield.estimate.register import Target, register, super_fibonacci, turns_about
 from refield.field.render import render_camera
 from refield.scene.camera import Camera
 from refield.scene.capture import camera_rays
 from refield.scene.pose import angle_between, invert, transform
-from refield.vision.segmenter import GrabCutSegmenter
+from refield.vision.matcher import SiftMatcher
 from tests.estimate.boxes import BoxWorld, camera_at, capture_of, new_photos, standing, turn
 
 CRATE = standing((0.2, 0.17, 0.18), -0.2, -0.15, 20, paint=3)
@@ -40,10 +42,12 @@ def stage(tmp_path_factory):
     capture = capture_of(BEFORE, folder / "before")
     frames = new_photos(BoxWorld((CRATE.moved(TRUE),)), folder / "after")
     config = recipe.EstimateConfig(survey=6)
-    scene = recipe._detected(capture, BEFORE, frames, config, GrabCutSegmenter())
+    scene = recipe._detected(capture, BEFORE, frames, config, Models())
     region = recipe.hull.find_region(scene.changed, config.hull)
     carved, free = recipe._carved(scene, region)
-    (old,) = recipe._were_there(scene, carved, changed_parts(scene.changed, carved, free, 40, scene.segmenter)[0])
+    (old,) = recipe._were_there(
+        scene, carved, changed_parts(scene.changed, carved, free, 40, scene.models.segmenter)[0]
+    )
     past = look_past(BEFORE, scene.changed, scene.survey, [old], config.detect)
     return Stage(scene, old, past)
 
@@ -93,13 +97,12 @@ def test_matched_points_give_the_pose_although_some_are_wrong():
 
 def test_nothing_matches_without_texture(stage):
     grey = [replace(p, changed=replace(p.changed, view=replace(p.view, photo=p.view.photo * 0))) for p in stage.past]
-    assert matched_poses(stage.old, grey, stage.scene.survey) == []
+    assert matched_poses(stage.old, grey, stage.scene.survey, SiftMatcher()) == []
 
 
 def test_refinement_through_the_field_improves_a_rough_pose(stage):
     rough = turn(transform(TRUE, CRATE.world_from_box[:3, 3]), 3.0, (0.01, -0.008, 0.006), axis=(0.6, 0, 0.8)) @ TRUE
-    r = refiner(BEFORE, stage.old, stage.past, [stage.old], rough, RefineConfig())
-    found = refine(r, rough)
+    found = refine(Sight(BEFORE, stage.old, stage.past, [stage.old]), rough)
     degrees, distance = error(found.new_from_old)
     assert degrees < 0.6 and distance < 0.005
     assert found.explained > 0.8 > found.before + 0.2
@@ -108,14 +111,14 @@ def test_refinement_through_the_field_improves_a_rough_pose(stage):
 
 def test_colour_slopes_with_respect_to_the_pose_are_those_of_finite_differences(stage):
     """The sliding-layer derivative: same direction and size for every one of six motions."""
-    r = refiner(BEFORE, stage.old, stage.past, [stage.old], TRUE, RefineConfig())
-    now = r.residuals(TRUE, 1.5)
+    r, config = layers(Sight(BEFORE, stage.old, stage.past, [stage.old]), TRUE, 12_000), RefineConfig(shaded=0.0)
+    now = residuals(r, TRUE, 1.5, config)
     inner = now.weight > 0.5
     for k in range(6):
         h = 0.6 * r.pixel if k < 3 else 0.6 * r.pixel / r.old.radius
         twist = torch.zeros(6, dtype=torch.float64)
         twist[k] = h
-        plus, minus = (r.residuals(r.moved(TRUE, s * twist), 1.5, slopes=False).error for s in (1, -1))
+        plus, minus = (residuals(r, r.moved(TRUE, s * twist), 1.5, config, slopes=False).error for s in (1, -1))
         measured = ((plus - minus) / (2 * h))[inner].reshape(-1)
         said = now.jacobian[..., k][inner].reshape(-1)
         cosine = float((measured * said).sum() / (measured.norm() * said.norm()))

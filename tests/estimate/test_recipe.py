@@ -47,7 +47,7 @@ def test_a_moved_box_is_found_with_its_pose_shape_and_masks(old, tmp_path):
     c = centre(CRATE)
     assert float((transform(moved.new_from_old, c) - transform(true, c)).norm()) < 0.006
     held, iou = overlap(moved.grid, CRATE)
-    assert held > 0.97 and iou > 0.6  # the mask takes in the field's soft surface
+    assert held > 0.88 and iou > 0.8
     assert torch.linalg.eigvalsh(moved.covariance).min() > 0
     assert "1 moved by" in change.why
     assert len(moved.masks) == len(moved.masks_in) == len(old.train)
@@ -65,7 +65,7 @@ def test_a_removed_box_is_found(old, tmp_path):
     (gone,) = estimate(old, BoxWorld((DRUM,)), tmp_path).objects
     assert gone.kind == "removed" and gone.new_from_old is None
     held, iou = overlap(gone.grid, CRATE)
-    assert held > 0.97 and iou > 0.6
+    assert held > 0.88 and iou > 0.8
 
 
 def test_an_added_box_is_found(old, tmp_path):

@@ -8,10 +8,12 @@ import torch
 
 from refield.scene.pose import angle_between, invert, transform
 from refield.synthetic.cameras import HEIGHTS, RADIUS, hemisphere, ring, square_camera
+from refield.synthetic.paper_worlds import PAPER_MOVE
+from refield.synthetic.placing import FLOOR_HALF
 from refield.synthetic.shapes import Box, Cone, Cylinder, Sphere
 from refield.synthetic.textures import to_linear, to_srgb
 from refield.synthetic.visibility import view_hits
-from refield.synthetic.worlds import FLOOR_HALF, PAPER_MOVE, WORLDS
+from refield.synthetic.worlds import WORLDS
 
 ONE_MOVED = ("cube", "cylinder", "sphere", "cone", "tipped", "shadow", "plain", "cluttered", "table")
 KINDS = {name: ["moved"] for name in ONE_MOVED} | {
@@ -29,7 +31,7 @@ def uniform(n, seed=0):
 
 @pytest.fixture(scope="module")
 def worlds():
-    return {name: build(0) for name, build in WORLDS.items()}
+    return {name: WORLDS[name](0) for name in KINDS}  # the hard ones have their own tests
 
 
 def test_every_world_changes_as_its_name_says(worlds):

@@ -15,7 +15,7 @@ from refield.commands.page import page
 from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.evaluate import Report, evaluate
 from refield.field.radiance import Field
-from refield.history import changed_visits, retouched, state, untouched_psnr
+from refield.history import changed_visits, known_objects, retouched, state, untouched_psnr
 from refield.report import summary, write_report
 from refield.scene.capture import Capture
 from refield.scene.change import SceneChange
@@ -61,7 +61,8 @@ class Visit:
 def run(options: Update) -> None:
     clock = Clock()
     visit = update(options, clock)
-    print(summary(visit.change) if visit.change.objects else "nothing changed")
+    unclear = visit.change.objects or visit.change.unexplained
+    print(summary(visit.change) if unclear else "nothing changed")
     if visit.change.why:
         print(visit.change.why)
     print(f"report: {visit.html}")
@@ -80,7 +81,8 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         number = workspace.visits
         old = state(workspace, number)
         capture = _capture_now(workspace, number, old, clock, Path(scratch))
-        change = estimate_change(capture, old, frames, options.estimate, on_stage=clock.stage)
+        known = known_objects(workspace, number)
+        change = estimate_change(capture, old, frames, options.estimate, on_stage=clock.stage, known=known)
         _need_a_photo(options.photos, change)
         new = _updated(capture, old, change, options.update, clock)
         clock.stage("report")

@@ -2,45 +2,54 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from refield.estimate.look import Seen, shaded
 from refield.estimate.objects import Old
 from refield.field.radiance import Field
+from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples
-from refield.field.warp import crossing
+from refield.field.warp import crossing, outline
 from refield.scene.capture import Rays
 from refield.scene.pose import invert, rotate, transform
 
 
-def object_alone(field: Field, old: Old, rays: Rays, new_from_old: Tensor) -> Seen:
+def sampler_around(field: Field, old: Old) -> OccupancySampler:
+    """The field's own sampler, which no longer looks anywhere but around the object's old place."""
+    sampler = field.sampler
+    only = torch.zeros_like(sampler.grid)
+    cells = sampler.cells_in(outline(old.grid))
+    only.view(-1)[cells] = sampler.grid.reshape(-1)[cells]
+    return replace(sampler, grid=only)
+
+
+def object_alone(
+    field: Field, old: Old, rays: Rays, new_from_old: Tensor, sampler: OccupancySampler | None = None
+) -> Seen:
     """Colour (premultiplied), median depth and opacity of a moved object's own samples along rays.
 
     The samples are where the field's own sampler has them: a field is only right at the spacing it was trained with.
-    Its colours are asked along directions that old photos looked along.
+    Its colours are asked along directions that old photos looked along. ``sampler``: of `sampler_around`, if known.
     """
     old_from_new = invert(new_from_old)
     there = Rays(transform(old_from_new, rays.origins), rotate(old_from_new, rays.directions))
     n = len(rays)
     rgb, depth, opacity = torch.zeros(n, 3), torch.full((n,), torch.inf), torch.zeros(n)
-    near, far = crossing(there, old.grid.tight_aabb())
+    near, far = crossing(there, outline(old.grid))
     hit = (far > near).nonzero()[:, 0]
     if len(hit) == 0:
         return Seen(rgb, depth, opacity)
     there = there[hit]
-    samples = field.sampler(there)
+    samples = (sampler_around(field, old) if sampler is None else sampler)(there)
     ids = samples.ray_ids
-    middle = (samples.t_starts + samples.t_ends) / 2
-    keep = ((middle > near[hit][ids]) & (middle < far[hit][ids])).nonzero()[:, 0]
-    x = there.origins[ids[keep]] + there.directions[ids[keep]] * middle[keep, None]
-    inside = old.grid.contains(x)
-    keep, x = keep[inside], x[inside]
+    x, d = samples.positions(there)
+    keep = old.grid.contains(x).nonzero()[:, 0]
     counts = torch.bincount(ids[keep], minlength=len(hit))
-    offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-    own = Samples(samples.t_starts[keep], samples.t_ends[keep], offsets)
+    own = Samples(samples.t_starts[keep], samples.t_ends[keep], torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
     with torch.no_grad():
-        along = old.outlook.held(x, there.directions[ids[keep]])
-        seen = shaded(field, (x, along), field.density(x), own)
+        seen = shaded(field, (x[keep], d[keep]), field.density(x[keep]), own, old.outlook.held)
     rgb[hit], depth[hit], opacity[hit] = seen.rgb, seen.depth, seen.opacity
     return Seen(rgb, depth, opacity)

@@ -18,17 +18,19 @@ from refield.estimate.alone import object_alone
 from refield.estimate.detect import Changed, DetectConfig, Mask
 from refield.estimate.hull import Hull, HullConfig, Plane, votes
 from refield.estimate.lattice import Lattice, Voxels, components, grown
+from refield.estimate.layers import Sight
 from refield.estimate.light import even_and_grey, log_ratio
 from refield.estimate.look import Array, View
 from refield.estimate.matched import matched_poses
 from refield.estimate.objects import Old
 from refield.estimate.outline import ObjectConfig, restricted
 from refield.estimate.past import Past, changed_share, gone_score, look_past
-from refield.estimate.pose_change import PoseChange, RefineConfig, refine, refiner
+from refield.estimate.pose_change import PoseChange, RefineConfig, refine
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
 from refield.field.radiance import Field
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
+from refield.vision.matcher import Matcher
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ class Ground:
     believe: AssociateConfig
     search: RegisterConfig
     fine: RefineConfig
+    matcher: Matcher
 
 
 @dataclass(frozen=True)
@@ -137,7 +140,10 @@ def _place_all(
 ) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:
     """Place the old objects that fit somewhere, the best first, taking each off the photos."""
     moved: dict[int, PoseChange] = {}
-    guesses = {k: matched_poses(old, views, ground.survey) for k, old in list(olds.items())[: ground.believe.most]}
+    guesses = {
+        k: matched_poses(old, views, ground.survey, ground.matcher)
+        for k, old in list(olds.items())[: ground.believe.most]
+    }
     everyone = list(olds.values())
     while True:
         parts = newcomers(ground, arrivals(ground, views, everyone), views)[: ground.believe.most]
@@ -263,15 +269,15 @@ def best_fit(
         found += register(old.cloud, past, target, ground.up, ground.search, extra)
     found.sort(key=lambda c: c.score)
     best: PoseChange | None = None
+    sight = Sight(ground.field, old, past, olds)
     for candidate in found[: believe.refined]:
         if candidate.score > min(believe.fits, found[0].score + 0.1):
             break
-        ready = refiner(ground.field, old, past, olds, candidate.new_from_old, ground.fine)
-        if not ready.crops:
-            continue
-        change = refine(ready, candidate.new_from_old)
-        if best is None or change.explained > best.explained + 0.02:
+        change = refine(sight, candidate.new_from_old, ground.fine, finest=1)
+        if change is not None and (best is None or change.explained > best.explained + 0.02):
             best = change
+    if best is not None:
+        best = refine(sight, best.new_from_old, ground.fine)
     if best is not None and (best.explained < believe.explains or best.explained < best.before + believe.gains):
         best = None
     return (found[0].score if found else 2.0), best
@@ -299,8 +305,8 @@ def trimmed(
     if not parts or parts[0].sum() < 0.25 * len(places):
         return old, change
     smaller = restricted(old, parts[0], ground.shape)
-    again = refine(refiner(ground.field, smaller, past, olds, change.new_from_old, ground.fine), change.new_from_old)
-    return (smaller, again) if again.explained > change.explained - 0.02 else (old, change)
+    again = refine(Sight(ground.field, smaller, past, olds), change.new_from_old, ground.fine)
+    return (old, change) if again is None or again.explained <= change.explained - 0.02 else (smaller, again)
 
 
 def take_off(field: Field, past: Sequence[Past], old: Old, change: PoseChange) -> list[Past]:

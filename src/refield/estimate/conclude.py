@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from scipy import ndimage
@@ -14,39 +16,56 @@ from refield.estimate.associate import Settled, shadow_of
 from refield.estimate.detect import Changed, Mask
 from refield.estimate.hull import Hull
 from refield.estimate.lattice import Lattice, Voxels
+from refield.estimate.layers import Sight, layers
+from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.pose_change import PoseChange
+from refield.field.radiance import Field
 from refield.scene.capture import Frame
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
 from refield.scene.pose import adjoint, angle_between, rigid, transform
 from refield.vision import pixels
 
+_NOTABLE = 0.002  # of a photo's pixels; smaller spots that nothing explains are not spoken of
+_MUCH = 0.25  # of the changed pixels; less that nothing explains is the ragged edge of what something does
+_MASK_RAYS = 300_000  # for the outlines of one object in all new photos; larger photos' masks are scaled up
 
-def concluded(
-    frames: Sequence[Frame],
-    changed: Sequence[Changed],
-    photos: tuple[PlacedPhoto, ...],
-    settled: Settled,
-    carved: Hull,
-) -> SceneChange:
-    """``frames`` are the old training photos; ``changed`` and ``settled.views`` go with the used new photos."""
-    olds = settled.olds
-    changes, reasons = [], []
-    for k, change in settled.moved.items():
-        changes.append(_moved(frames, olds[k], change))
-        reasons.append(_why_moved(olds[k], change))
+
+@dataclass(frozen=True)
+class Told:
+    """What a conclusion is drawn from, besides what was settled."""
+
+    field: Field
+    frames: Sequence[Frame]
+    """the old training photos"""
+    changed: Sequence[Changed]
+    photos: tuple[PlacedPhoto, ...]
+    """all of the new ones; ``changed`` and the settled views go with those that are used"""
+    carved: Hull
+
+
+def concluded(scene: Told, settled: Settled) -> SceneChange:
+    """The estimate's answer: what is believed, why, and what is not understood."""
+    olds, frames, lattice = settled.olds, scene.frames, scene.carved.lattice
+    changes = [_moved(frames, olds[k], change) for k, change in settled.moved.items()]
     for k, share in settled.removed.items():
-        masks = segment.masks_out(frames, olds[k])
-        changes.append(ObjectChange("removed", olds[k].grid, masks=masks, confidence=share))
-        reasons.append(f"1 removed: {100 * share:.0f} % of its pixels show what is behind it")
+        note = f"{100 * share:.0f} % of its pixels show what is behind it"
+        masks = _masks_of(frames, olds[k])
+        changes.append(ObjectChange("removed", olds[k].shape, masks=masks, confidence=share, note=note))
     for part in settled.arrived:
-        grid = _newcomer(carved.lattice, part)
-        changes.append(ObjectChange("added", grid, masks_in=segment.masks_in(frames, grid)))
-        reasons.append("1 added: it hides what was there, and nothing that left looks like it")
-    if not changes:
-        why = "some pixels differ, but no object that moved, left or arrived explains them better than the old field"
-        return SceneChange((), photos, why)
-    return SceneChange(tuple(changes), photos, "; ".join(reasons), *_pixel_masks(changed, settled, carved.lattice))
+        grid, share = _newcomer(lattice, part), _fresh(settled, lattice, part)
+        note = f"it hides what was there in {100 * share:.0f} % of its pixels, and nothing that left looks like it"
+        changes.append(
+            ObjectChange("added", grid, masks_in=segment.masks_in(frames, grid), confidence=share, note=note)
+        )
+    left = _unexplained(scene, settled)
+    reasons = [f"1 {c.note}" if c.kind == "moved" else f"1 {c.kind}: {c.note}" for c in changes]
+    reasons += [_said_of(scene, left)] if left else []
+    if not reasons:
+        reasons = ["some pixels differ, but no object that moved, left or arrived explains them better than before"]
+    ins, outs = _pixel_masks(scene.field, scene.changed, settled, lattice) if changes else ((), ())
+    unexplained = tuple(_full_size(m, c) for m, c in zip(left, scene.changed))
+    return SceneChange(tuple(changes), scene.photos, "; ".join(reasons), ins, outs, unexplained)
 
 
 def _moved(frames: Sequence[Frame], old: Old, change: PoseChange) -> ObjectChange:
@@ -54,14 +73,19 @@ def _moved(frames: Sequence[Frame], old: Old, change: PoseChange) -> ObjectChang
     about = adjoint(rigid(torch.eye(3, dtype=torch.float64), centre))
     return ObjectChange(
         "moved",
-        old.grid,
+        old.shape,
         change.new_from_old,
-        segment.masks_out(frames, old),
-        segment.masks_in(frames, old.grid.moved(change.new_from_old)),
+        _masks_of(frames, old),
+        segment.masks_in(frames, old.shape.moved(change.new_from_old)),
         confidence=change.explained,
         covariance=about @ change.covariance @ about.T,
-        note=change.note,
+        note=_why_moved(old, change),
     )
+
+
+def _masks_of(frames: Sequence[Frame], old: Old) -> tuple[Tensor | None, ...]:
+    """Where the object was, on every old photo; a remembered one is projected, as its new place is."""
+    return segment.masks_in(frames, old.shape) if old.remembered else segment.masks_out(frames, old)
 
 
 def _why_moved(old: Old, change: PoseChange) -> str:
@@ -69,8 +93,44 @@ def _why_moved(old: Old, change: PoseChange) -> str:
     shift = float((transform(change.new_from_old, centre) - centre).norm())
     turn = float(angle_between(change.new_from_old, torch.eye(4, dtype=torch.float64)))
     return (
-        f"1 moved by {shift:.3g} and turned by {turn:.0f} degrees: {100 * change.explained:.0f} % of its pixels show it"
+        f"moved by {shift:.3g} and turned by {turn:.0f} degrees, {100 * change.explained:.0f} % of its pixels show it"
         f" at its new place, {100 * change.before:.0f} % what was there before"
+    ) + (f"; {change.note}" if change.note else "")
+
+
+def _fresh(settled: Settled, lattice: Lattice, part: Voxels) -> float:
+    """Part of a newcomer's pixels that nothing else explains, the median over photos that show any."""
+    shadows = [(shadow_of(p.view, lattice, part), p.open) for p in settled.views]
+    shares = [float((here & left).sum() / here.sum()) for here, left in shadows if here.any()]
+    return float(np.median(shares)) if shares else 0.0
+
+
+def _unexplained(scene: Told, settled: Settled) -> list[Mask]:
+    """Per photo, the changed pixels that nothing accounts for; nothing at all if they are few."""
+    out = []
+    for c, p in zip(scene.changed, settled.views or ()):
+        told = pixels.dilate(p.covered, 3) | p.explained | ~p.known
+        for k in (*settled.moved, *settled.removed):
+            told |= pixels.dilate(past.silhouette(c.view, settled.olds[k]), 3)
+        for part in settled.arrived:
+            told |= pixels.dilate(shadow_of(c.view, scene.carved.lattice, part), 3)
+        left = c.mask & ~told
+        left = pixels.dilate(pixels.erode(left, 1), 1) & left
+        out.append(pixels.keep_components(left, max(12, _NOTABLE * left.size)))
+    unclear, changed = (sum(int(m.sum()) for m in masks) for masks in (out, [c.mask for c in scene.changed]))
+    return out if unclear > _MUCH * changed else []
+
+
+def _said_of(scene: Told, left: Sequence[Mask]) -> str:
+    share = sum(int(m.sum()) for m in left) / max(sum(int(c.mask.sum()) for c in scene.changed), 1)
+    points = np.concatenate([c.view.surface[m & np.isfinite(c.view.depth)] for c, m in zip(scene.changed, left)])
+    where = ""
+    if len(points):
+        low, high = (", ".join(f"{v:.3g}" for v in np.quantile(points, q, axis=0)) for q in (0.05, 0.95))
+        where = f" before what lies between ({low}) and ({high})"
+    return (
+        f"{100 * share:.0f} % of the changed pixels{where} are not understood: something that bends, flows or shines,"
+        " or light that changed"
     )
 
 
@@ -79,12 +139,12 @@ def _newcomer(lattice: Lattice, part: Voxels) -> OccupancyGrid:
 
 
 def _pixel_masks(
-    changed: Sequence[Changed], settled: Settled, lattice: Lattice
+    field: Field, changed: Sequence[Changed], settled: Settled, lattice: Lattice
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Per new photo at its full size: changed pixels that show what is there now, and where something used to be."""
+    """Per new photo at its full size: what shows that arrived or moved, and where something used to be."""
     ins, outs = [], []
-    for c, seen in zip(changed, settled.views):
-        came = seen.covered.copy()
+    for c in changed:
+        came = np.zeros(c.view.shape, bool)
         for part in settled.arrived:
             came |= shadow_of(c.view, lattice, part)
         gone = np.zeros(c.view.shape, bool)
@@ -92,7 +152,26 @@ def _pixel_masks(
             gone |= past.silhouette(c.view, settled.olds[k])
         ins.append(_full_size(c.mask & came, c))
         outs.append(_full_size(pixels.dilate(gone, 1), c))
+    olds = [settled.olds[k] for k in (*settled.moved, *settled.removed)]
+    for k, change in settled.moved.items():
+        shown = _shown_in(Sight(field, settled.olds[k], settled.views, olds), change.new_from_old)
+        ins = [a | shown[i] if i in shown else a for i, a in enumerate(ins)]
     return tuple(ins), tuple(outs)
+
+
+def _shown_in(sight: Sight, new_from_old: Tensor) -> dict[int, Tensor]:
+    """The moved object's outline in each photo that shows it, by the photo's index, (H, W) bool."""
+    ready = layers(sight, new_from_old, _MASK_RAYS)
+    out = {}
+    for crop, shown in zip(ready.crops, ready.show(new_from_old)):
+        x0, y0, x1, y1 = crop.box
+        full: Array = np.zeros((crop.camera.height, crop.camera.width), np.float32)
+        full[y0:y1, x0:x1] = shown.opacity.reshape(crop.shape).numpy()
+        camera = sight.past[crop.photo_index].view.frame.camera
+        if (camera.width, camera.height) != (crop.camera.width, crop.camera.height):
+            full = cv2.resize(full, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        out[crop.photo_index] = torch.from_numpy(full > 0.5)
+    return out
 
 
 def _full_size(mask: Mask, c: Changed) -> Tensor:

@@ -43,8 +43,9 @@ def changed_parts(
     label = np.zeros(lattice.shape, np.int32)
     for k, face in enumerate(faces, start=1):
         label[face & (label == 0)] = k
-    nearest = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
-    label = label[tuple(nearest)]
+    (box,) = ndimage.find_objects(solid.astype(np.int8))  # the faces lie in it, and nothing else is asked for
+    nearest = ndimage.distance_transform_edt(label[box] == 0, return_distances=False, return_indices=True)
+    label[box] = label[box][tuple(nearest)]
     things: list[Voxels] = []
     others: list[Voxels] = []
     for k, face in enumerate(faces, start=1):
@@ -97,8 +98,8 @@ def _joined(faces: Sequence[Voxels]) -> list[Voxels]:
     if not faces:
         return []
     flat = np.stack([f.ravel() for f in faces])
-    sizes = flat.sum(1)
-    shared = flat.astype(np.float32) @ flat.astype(np.float32).T
+    few = flat[:, flat.any(0)].astype(np.float32)
+    sizes, shared = few.sum(1), few @ few.T
     same = shared > _SHARED * np.minimum(sizes[:, None], sizes[None])
     _, group = connected_components(coo_matrix(same), directed=False)
     return [flat[group == g].any(0).reshape(faces[0].shape) for g in range(group.max() + 1)]

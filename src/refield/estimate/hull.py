@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from refield.estimate.carve_kernels import Window, count_votes, find_behind, find_on_surface, packed
 from refield.estimate.detect import Changed, Mask
 from refield.estimate.lattice import Lattice, Voxels
 from refield.estimate.look import Array, View
@@ -77,26 +78,35 @@ def votes(points: Array, seen: Sequence[tuple[View, Mask]], config: HullConfig) 
     A view contradicts where its mask does not hold the point and the old surface there is not in front of it.
     """
     inside_count, against = np.zeros(len(points), np.int16), np.zeros(len(points), np.int16)
-    for view, mask in seen:
-        uv, distance, inside = view.project(points)
-        in_mask = view.lookup(mask, uv, inside) & inside
-        front = view.lookup(view.depth, uv, inside)
-        in_sight = inside & (distance < front + tolerance(view, distance, config))
-        inside_count += in_mask
-        against += in_sight & ~in_mask
+    masks = np.concatenate([np.zeros(0, bool), *(mask.ravel() for _, mask in seen)], dtype=bool)
+    count_votes(_rows(points), *_windows([view for view, _ in seen], config), masks, inside_count, against)
     return inside_count, against
 
 
 def look_behind(points: Array, views: Sequence[View], config: HullConfig) -> tuple[NDArray[np.bool_], Array]:
     """Whether some old rendering looks through each point (N, 3), and how far behind the old surface it is, in the
     view that comes nearest to it; inf where none looks."""
-    through, behind = np.zeros(len(points), bool), np.full(len(points), np.inf, np.float32)
-    for view in views:
-        uv, distance, inside = view.project(points)
-        front = view.lookup(view.depth, uv, inside)
-        through |= inside & (distance < front - tolerance(view, distance, config))
-        behind = np.minimum(behind, np.where(inside & np.isfinite(front), distance - front, np.inf))
+    through, behind = np.zeros(len(points), bool), np.zeros(len(points), np.float32)
+    find_behind(_rows(points), *_windows(views, config), through, behind)
     return through, behind
+
+
+def on_surface(points: Array, views: Sequence[View], config: HullConfig) -> NDArray[np.bool_]:
+    """Whether each point (N, 3) is within two tolerances of the old surface that some view looks at."""
+    lenses, depths, slack = _windows(views, config)
+    found = np.zeros(len(points), bool)
+    find_on_surface(_rows(points), lenses, depths, 2 * slack, found)
+    return found
+
+
+def _rows(points: Array) -> Array:
+    return np.ascontiguousarray(points, np.float32)
+
+
+def _windows(views: Sequence[View], config: HullConfig) -> tuple[Array, Array, Array]:
+    """What the kernels know whole views by, and their tolerances per unit of distance."""
+    lenses, depths = packed(Window(v.camera, v.frame.world_from_cam, v.depth) for v in views)
+    return lenses, depths, np.array([config.surface * v.pixel_angle for v in views], np.float64)
 
 
 def find_region(changed: Sequence[Changed], config: HullConfig) -> Lattice | None:

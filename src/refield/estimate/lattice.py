@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from refield.estimate.carve_kernels import find_held, spread
 from refield.estimate.look import Array
 from refield.scene.change import OccupancyGrid
 
@@ -51,8 +52,10 @@ class Lattice:
 
     def holds(self, voxels: Voxels, points: Array) -> NDArray[np.bool_]:
         """Whether each point (..., 3) lies in one of the voxels."""
-        ijk, inside = self.index(points)
-        return voxels[ijk[..., 0], ijk[..., 1], ijk[..., 2]] & inside
+        out = np.zeros(points.shape[:-1], bool)
+        rows = np.ascontiguousarray(points.reshape(-1, 3), np.float32)
+        find_held(rows, np.ascontiguousarray(voxels, bool), self.low, self.cell, out.reshape(-1))
+        return out
 
     def grid(self, values: Array) -> OccupancyGrid:
         """Values on this lattice as an occupancy grid (nodes at the voxels' centres)."""
@@ -74,4 +77,19 @@ def grown(voxels: Voxels, steps: int, within: Voxels | None = None) -> Voxels:
     """Dilated by ``steps`` in every direction, staying ``within``; steps < 0 grow until nothing is left to reach."""
     if steps == 0:
         return voxels
-    return ndimage.binary_dilation(voxels, _EVERY_WAY, iterations=max(steps, 0), mask=within)
+    if steps < 0:
+        labels, count = ndimage.label(voxels | (True if within is None else within), _EVERY_WAY)
+        reached = np.zeros(count + 1, bool)
+        reached[labels[voxels]] = True
+        return reached[labels]
+    if within is None:
+        return _spread(voxels, steps)
+    for _ in range(steps):
+        voxels = voxels | (_spread(voxels, 1) & within)
+    return voxels
+
+
+def _spread(voxels: Voxels, steps: int) -> Voxels:
+    out = np.zeros(voxels.shape, bool)
+    spread(np.ascontiguousarray(voxels, bool), steps, out)
+    return out

@@ -20,16 +20,45 @@ from torch import Tensor
 from refield.field.radiance import Field
 from refield.field.render import visible_samples
 from refield.field.volrend import Samples, composite, weights
+from refield.field.warp import crossing, inside_box, outline
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
+from refield.scene.change import OccupancyGrid
 from refield.scene.images import frame_image
 
-Hidden = Callable[[Tensor], Tensor]
-"""World points (S, 3) -> (S,) bool: samples to leave out."""
 Array = NDArray[Any]
+Directed = Callable[[Tensor, Tensor], Tensor]
+"""World points and directions (S, 3) -> the directions along which to ask for colours, (S, 3)."""
 
 _CHUNK = 8192
 _NEGLIGIBLE = 1e-3  # weight of a sample whose colour is not asked for; the sum of what is lost stays below a grey level
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """Samples to leave out: what some grids contain."""
+
+    grids: tuple[OccupancyGrid, ...]
+
+    @cached_property
+    def _boxes(self) -> list[Tensor]:
+        return [outline(g) for g in self.grids]
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """World points (S, 3) -> (S,) bool."""
+        found = torch.zeros(len(x), dtype=torch.bool)
+        for grid, box in zip(self.grids, self._boxes):
+            near = (inside_box(x, box) & ~found).nonzero()[:, 0]
+            found[near] = grid.contains(x[near])
+        return found
+
+    def meets(self, rays: Rays) -> Tensor:
+        """Whether each ray crosses a box around what is hidden, (N,) bool."""
+        out = torch.zeros(len(rays), dtype=torch.bool)
+        for box in self._boxes:
+            near, far = crossing(rays, box)
+            out |= far > near
+        return out
 
 
 @dataclass(frozen=True)
@@ -46,6 +75,19 @@ class Seen:
 
 def see(field: Field, rays: Rays, hidden: Hidden | None = None) -> Seen:
     """Colour, median depth and opacity of rays through the field, without the samples that are ``hidden``."""
+    if hidden is None or not hidden.grids:
+        return _see_all(field, rays, None)
+    near = hidden.meets(rays)
+    if near.all():
+        return _see_all(field, rays, hidden)
+    # what is hidden may uncover what the field's own choice of samples leaves out; other rays need no such care
+    rows = (~near).nonzero()[:, 0], near.nonzero()[:, 0]
+    parts = [_see_all(field, rays[r], h) for r, h in zip(rows, (None, hidden))]
+    order = torch.argsort(torch.cat(rows))
+    return Seen(*(torch.cat([getattr(p, n) for p in parts])[order] for n in ("rgb", "depth", "opacity")))
+
+
+def _see_all(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
     with torch.no_grad():
         parts = [_see(field, rays[i : i + _CHUNK], hidden) for i in range(0, max(len(rays), 1), _CHUNK)]
     return Seen(
@@ -54,22 +96,25 @@ def see(field: Field, rays: Rays, hidden: Hidden | None = None) -> Seen:
 
 
 def _see(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
-    # what is hidden may uncover what the field's own choice of samples leaves out
     samples = visible_samples(field, rays) if hidden is None else field.sampler(rays)
     x, d = samples.positions(rays)
-    sigmas = field.density(x)
-    if hidden is not None:
-        sigmas = torch.where(hidden(x), torch.zeros_like(sigmas), sigmas)
+    if hidden is None:
+        return shaded(field, (x, d), field.density(x), samples)
+    left = (~hidden(x)).nonzero()[:, 0]
+    sigmas = torch.zeros(len(x)).index_copy(0, left, field.density(x[left]))
     return shaded(field, (x, d), sigmas, samples)
 
 
-def shaded(field: Field, at: tuple[Tensor, Tensor], sigmas: Tensor, samples: Samples) -> Seen:
+def shaded(
+    field: Field, at: tuple[Tensor, Tensor], sigmas: Tensor, samples: Samples, along: Directed | None = None
+) -> Seen:
     """Composite samples whose densities are known; colours are asked for only where they count."""
     w = weights(sigmas, samples)
     count = (w > _NEGLIGIBLE).nonzero()[:, 0]
     rgbs = torch.zeros(len(w), 3)
     if len(count):
-        rgbs[count] = field(at[0][count], at[1][count])[1]
+        x, d = at[0][count], at[1][count]
+        rgbs[count] = field(x, d if along is None else along(x, d))[1]
     rendering = composite(sigmas, rgbs, samples)
     return Seen(rendering.rgb, median_depth(sigmas, samples), rendering.opacity)
 

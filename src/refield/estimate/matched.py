@@ -8,6 +8,7 @@ photo's pose against the object where it was: ``cam_from_old``. With the photo's
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,68 +18,91 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.estimate.detect import Mask
-from refield.estimate.look import Array, View
+from refield.estimate.look import View
 from refield.estimate.objects import Old
 from refield.estimate.past import Past, silhouette
 from refield.scene.camera import Camera
 from refield.vision import pixels
-from refield.vision.matcher import SiftMatcher
+from refield.vision.matcher import Matcher
 
-Features = tuple[NDArray[np.float64], NDArray[np.float32]]
+Points = NDArray[np.float64]
 
-_MATCHER = SiftMatcher()
-_MARGIN = 4  # pixels around the object that features are looked for in
-_CROP = 160  # pixels; what is smaller is enlarged to this before features are looked for
+_CROP = 160  # pixels; what is smaller is enlarged to this for the matcher
+_ENLARGE = 3.0  # but no more than so many times
+_LEAST_PIXELS = 30  # of the object in a picture, for it to be looked at
+
+
+@dataclass(frozen=True)
+class CutOut:
+    """The part of a picture around a mask, enlarged if it is small."""
+
+    picture: NDArray[np.uint8]
+    """(h, w, 3)"""
+    mask: Mask
+    """(H, W) of the whole picture"""
+    corner: tuple[int, int]
+    scale: float
+
+    @staticmethod
+    def of(picture: NDArray[np.uint8], mask: Mask, margin: int = 4) -> CutOut | None:
+        """None for an empty mask. ``margin``: pixels around it that the matcher sees too."""
+        box = pixels.bounding_box(mask, margin)
+        if box is None:
+            return None
+        x0, y0, x1, y1 = box
+        part = np.ascontiguousarray(picture[y0:y1, x0:x1])
+        scale = float(np.clip(_CROP / max(part.shape[:2]), 1, _ENLARGE))
+        if scale > 1:
+            size = (round(part.shape[1] * scale), round(part.shape[0] * scale))
+            part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_CUBIC), np.uint8)
+        return CutOut(part, mask, (x0, y0), scale)
+
+    def whole(self, uv: Points) -> Points:
+        """Pixels (K, 2) of the part, in the whole picture."""
+        return np.asarray(uv, np.float64) / self.scale + self.corner
+
+    def holds(self, uv: Points) -> NDArray[np.bool_]:
+        """Whether pixels (K, 2) of the whole picture lie in the mask."""
+        h, w = self.mask.shape
+        i, j = uv[:, 1].astype(int), uv[:, 0].astype(int)
+        within = (uv >= 0).all(-1) & (i < h) & (j < w)
+        return within & self.mask[np.clip(i, 0, h - 1), np.clip(j, 0, w - 1)]
+
+
+def matched_on(a: CutOut, b: CutOut, matcher: Matcher) -> tuple[Points, Points]:
+    """Corresponding pixels (K, 2) of two whole pictures that lie in both masks."""
+    uv_a, uv_b, _ = matcher.match(a.picture, b.picture)
+    uv_a, uv_b = a.whole(uv_a), b.whole(uv_b)
+    kept = a.holds(uv_a) & b.holds(uv_b)
+    return uv_a[kept], uv_b[kept]
 
 
 def matched_poses(
-    old: Old, past: Sequence[Past], survey: Sequence[View], least: int = 8, matcher: SiftMatcher = _MATCHER
+    old: Old, past: Sequence[Past], survey: Sequence[View], matcher: Matcher, least: int = 8
 ) -> list[Tensor]:
     """``new_from_old`` (4, 4) float64 guesses, at most one a photo, each with ``least`` or more inliers."""
     sources = [(p.view.rgb, p.view) for p in past] + [(v.photo, v) for v in survey]
-    known = [_object_features(image, view, silhouette(view, old), matcher) for image, view in sources]
-    known = [k for k in known if len(k[1])]
+    shown = [(silhouette(view, old), image, view) for image, view in sources]
+    known = [(CutOut.of(pixels.to_bytes(image), m), v) for m, image, v in shown if m.sum() >= _LEAST_PIXELS]
     out = []
     for p in past:
-        there = _features_in(p.view.photo, pixels.dilate(p.changed.mask, 1), matcher)
-        uv, xyz = [], []
-        for descriptors, points in known:
-            a, b, _ = matcher.match_features((points, descriptors), there)
-            xyz += list(a[:, 2:])
-            uv += list(b)
-        pose = camera_from_object(np.array(uv), np.array(xyz), p.view.camera, least)
+        mask = pixels.dilate(p.changed.mask, 1)
+        there = CutOut.of(pixels.to_bytes(p.view.photo), mask) if mask.sum() >= _LEAST_PIXELS else None
+        if there is None:
+            continue
+        uv, xyz = [np.zeros((0, 2))], [np.zeros((0, 3))]
+        for cut, view in known:
+            if cut is None:
+                continue
+            a, b = matched_on(cut, there, matcher)
+            points = view.surface[a[:, 1].astype(int), a[:, 0].astype(int)].astype(np.float64)
+            fine = np.isfinite(points).all(-1)
+            uv.append(b[fine])
+            xyz.append(points[fine])
+        pose = camera_from_object(np.concatenate(uv), np.concatenate(xyz), p.view.camera, least)
         if pose is not None:
             out.append(p.view.frame.world_from_cam @ pose)
     return out
-
-
-def _object_features(
-    image: Array, view: View, mask: Mask, matcher: SiftMatcher
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Descriptors (K, 128) and (K, 5): pixel and world point, of features on the object."""
-    xy, descriptors = _features_in(image, mask, matcher)
-    if len(xy) == 0:
-        return descriptors, np.zeros((0, 5))
-    points = view.surface[xy[:, 1].astype(int), xy[:, 0].astype(int)].astype(np.float64)
-    fine = np.isfinite(points).all(-1)
-    return descriptors[fine], np.concatenate([xy, points], -1)[fine]
-
-
-def _features_in(image: Array, mask: Mask, matcher: SiftMatcher) -> Features:
-    """Features of the part of an image in (H, W) bool ``mask``."""
-    box = pixels.bounding_box(mask, _MARGIN)
-    if box is None or mask.sum() < 30:
-        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    x0, y0, x1, y1 = box
-    crop = pixels.to_bytes(image[y0:y1, x0:x1])
-    scale = float(np.clip(_CROP / max(crop.shape[:2]), 1, 3))
-    if scale > 1:
-        crop = np.asarray(cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC), np.uint8)
-    xy, descriptors = matcher.features(crop)
-    xy = xy / scale + (x0, y0)
-    h, w = mask.shape
-    inside = mask[np.clip(xy[:, 1].astype(int), 0, h - 1), np.clip(xy[:, 0].astype(int), 0, w - 1)]
-    return xy[inside], descriptors[inside]
 
 
 def camera_from_object(uv: NDArray[np.float64], xyz: NDArray[np.float64], camera: Camera, least: int) -> Tensor | None:

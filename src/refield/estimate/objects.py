@@ -14,12 +14,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refield.estimate.lattice import Lattice, Voxels, grown
-from refield.estimate.look import Array, Hidden, see
+from refield.estimate.look import Array, see
 from refield.field.radiance import Field
 from refield.field.warp import Outlook
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
+
+_CARVED_AWAY = 0.6  # voxels
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,8 @@ class Old:
     patches: tuple[Patch, ...]
     margin: int = 2
     """voxels between its surface (the field's median depth) and where the field's soft surface ends"""
+    remembered: bool = False
+    """its shape is that of an earlier visit; ``patches`` are of some old views only"""
 
     @property
     def centre(self) -> Array:
@@ -110,17 +114,20 @@ class Old:
         return Outlook.from_eyes(eyes, self.grid)
 
     @cached_property
-    def _sides(self) -> tuple[cKDTree, NDArray[np.int64], float]:
-        """The cloud, the side of each of its points, and how near to one of them a surface point must be."""
-        tree = cKDTree(self.cloud.points)
-        apart = float(np.median(tree.query(self.cloud.points, 2)[0][:, 1]))
-        return tree, sides_of(self.cloud.normals), 2 * apart + self.margin * self.lattice.cell
+    def _sides(self) -> NDArray[np.int64]:
+        """The side of the object near each voxel; -1 where no old photo saw its surface."""
+        out = np.full(self.lattice.shape, -1)
+        ijk, inside = self.lattice.index(self.cloud.points)
+        out[tuple(ijk[inside].T)] = sides_of(self.cloud.normals)[inside]
+        apart = float(np.median(cKDTree(self.cloud.points).query(self.cloud.points, 2)[0][:, 1]))
+        distance, nearest = ndimage.distance_transform_edt(out < 0, return_indices=True)
+        reach = 2 * apart / self.lattice.cell + self.margin
+        return np.where(distance <= reach, out[tuple(nearest)], -1)
 
     def side_of(self, points: Array) -> NDArray[np.int64]:
         """Which of its six sides surface points (N, 3) are on, at its old place; -1 where no old photo saw it."""
-        tree, sides, reach = self._sides
-        distance, nearest = tree.query(points, distance_upper_bound=reach)
-        return np.where(np.isfinite(distance), np.append(sides, -1)[nearest], -1)
+        ijk, inside = self.lattice.index(points)
+        return np.where(inside, self._sides[tuple(ijk.T)], -1)
 
     @property
     def volume(self) -> float:
@@ -133,10 +140,21 @@ class Old:
         values = ndimage.gaussian_filter((grown(self.voxels, self.margin) & self.free).astype(np.float32), 0.7)
         return self.lattice.grid(values)
 
-    def hidden(self, margin: int = 3) -> Hidden:
-        """Whether points belong to the object or the haze around it, for looking past it."""
-        grid = self.lattice.grid((grown(self.voxels, margin) & self.free).astype(np.float32))
-        return grid.contains
+    @cached_property
+    def shape(self) -> OccupancyGrid:
+        """The object without the softness that the field gives to its surface.
+
+        Views that look along a surface see past what the field has there, so carving leaves it a little too small.
+        """
+        outside, inside = (ndimage.distance_transform_edt(v) for v in (~self.voxels, self.voxels))
+        depth = np.where(self.voxels, inside - 0.5, 0.5 - outside).astype(np.float32)
+        depth = ndimage.gaussian_filter(depth, 0.7) + _CARVED_AWAY
+        return self.lattice.grid(np.clip(0.5 + depth / 2, 0, 1))
+
+    @cached_property
+    def haze(self) -> OccupancyGrid:
+        """The object and the haze around it, for looking past it."""
+        return self.lattice.grid((grown(self.voxels, self.margin + 1) & self.free).astype(np.float32))
 
 
 def patch_rays(camera: Camera, frame: Frame, box: tuple[int, int, int, int]) -> Rays:

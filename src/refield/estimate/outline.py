@@ -13,11 +13,14 @@ import numpy as np
 import torch
 from scipy import ndimage
 
+from refield.estimate.carve_kernels import Window, find_solid, packed
 from refield.estimate.hull import Plane
 from refield.estimate.lattice import Lattice, Voxels, components, grown
+from refield.estimate.look import spread_out
 from refield.estimate.objects import Old, Patch, corners_of, look_around, surface_cloud
 from refield.field.radiance import Field
 from refield.scene.capture import Frame
+from refield.scene.change import OccupancyGrid
 from refield.vision import pixels
 from refield.vision.segmenter import Segmenter, cut_out
 
@@ -38,6 +41,8 @@ class ObjectConfig:
     """a voxel of an object that runs into others is not its own if more than this part of the old views say so"""
     changed: float = 0.5
     """part of an object's voxels that must be seeds for it to be taken whole"""
+    glances: int = 24
+    """old views that an object known from an earlier visit is looked at in"""
     points: int = 1500
     """on the coloured surface"""
 
@@ -77,9 +82,7 @@ def outline(
         return None
     lattice = Lattice.over(low, high, config.longest)
     solid = carve_solid(lattice, patches, config.through, float((places.max(0) - places.min(0)).max()))
-    free = np.ones(lattice.shape, bool)
-    for plane in planes:
-        free &= plane.height(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
+    free = _free(lattice, planes)
     voxels, stands_free = _connected(lattice, solid & free, seeds, config)
     if voxels.any() and not stands_free:
         voxels = _cut_out(lattice, voxels, patches, segmenter, config)
@@ -88,6 +91,34 @@ def outline(
     voxels = ndimage.binary_fill_holes(voxels)
     cloud = surface_cloud(lattice, voxels, patches, config.points)
     return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= 30 else None
+
+
+def remembered(
+    field: Field, frames: Sequence[Frame], grid: OccupancyGrid, planes: Sequence[Plane], config: ObjectConfig
+) -> Old | None:
+    """An object whose shape an earlier visit found, where it stood before this one (§11.3.2); None if no view shows it.
+
+    Nothing is segmented or carved; a few old views are enough to see its colours again.
+    """
+    low, high = grid.tight_aabb().numpy()
+    pad = 0.2 * float((high - low).max())
+    lattice = Lattice.over(low - pad, high + pad, config.longest)
+    voxels = grid.contains(torch.from_numpy(lattice.centres)).numpy()
+    some = spread_out(frames, config.glances)
+    patches = look_around(field, some, corners_of(low - pad, high + pad), config.rays * config.glances // len(frames))
+    if not patches or not voxels.any():
+        return None
+    cloud = surface_cloud(lattice, voxels, patches, config.points)
+    free = _free(lattice, planes)
+    return Old(lattice, voxels, free, cloud, tuple(patches), remembered=True) if len(cloud.points) >= 30 else None
+
+
+def _free(lattice: Lattice, planes: Sequence[Plane]) -> Voxels:
+    """Voxels in front of what holds things up."""
+    free = np.ones(lattice.shape, bool)
+    for plane in planes:
+        free &= plane.height(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
+    return free
 
 
 def _connected(lattice: Lattice, solid: Voxels, seeds: Seeds, config: ObjectConfig) -> tuple[Voxels, bool]:
@@ -151,16 +182,10 @@ def restricted(old: Old, voxels: Voxels, config: ObjectConfig) -> Old:
 def carve_solid(lattice: Lattice, patches: Sequence[Patch], through: float, deepest: float) -> Voxels:
     """Voxels that at most the part ``through`` of the old views look through (§10.2.4's projection check), and that are
     at most ``deepest`` (world units) behind the surface in some view."""
-    points = torch.from_numpy(lattice.centres.reshape(-1, 3))
-    left = torch.arange(len(points))
-    passed = torch.zeros(len(points), dtype=torch.int16)
-    behind = torch.full((len(points),), torch.inf)
-    order = np.random.default_rng(0).permutation(len(patches))
-    for k in order:  # views that differ most come soon, so that air is dropped early
-        depth = patches[k].behind_surface(points[left])
-        passed[left] += (depth < -0.75 * lattice.cell).to(torch.int16)
-        behind[left] = torch.minimum(behind[left], depth)
-        left = left[passed[left] <= through * len(patches)]
+    points = lattice.centres.reshape(-1, 3)
+    order = np.random.default_rng(0).permutation(len(patches))  # views that differ most come soon: air is dropped early
+    ordered = [patches[k] for k in order]
+    lenses, depths = packed(Window(p.camera, p.frame.world_from_cam, p.depth, p.box[:2]) for p in ordered)
     solid = np.zeros(len(points), bool)
-    solid[left[behind[left] < deepest].numpy()] = True
+    find_solid(points, lenses, depths, 0.75 * lattice.cell, float(through * len(patches)), float(deepest), solid)
     return solid.reshape(lattice.shape)

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from refield.estimate.detect import Changed, DetectConfig, Mask, blur_sigma
-from refield.estimate.hull import HullConfig, tolerance
+from refield.estimate.hull import HullConfig, on_surface, tolerance
 from refield.estimate.lattice import grown
-from refield.estimate.look import Array, View, see
+from refield.estimate.look import Array, Hidden, View, see
 from refield.estimate.objects import Old
 from refield.field.radiance import Field
 from refield.vision import pixels
@@ -73,8 +73,7 @@ def _look_past(field: Field, c: Changed, survey: Sequence[View], olds: Sequence[
     rgb, depth = view.rgb.copy(), view.depth.copy()
     index = np.flatnonzero(was.ravel())
     if len(index):
-        tests = [old.hidden() for old in olds]
-        seen = see(field, view.rays[torch.from_numpy(index)], lambda x: torch.stack([t(x) for t in tests]).any(0))
+        seen = see(field, view.rays[torch.from_numpy(index)], Hidden(tuple(old.haze for old in olds)))
         rgb.reshape(-1, 3)[index] = seen.rgb.clamp(0, 1).numpy()
         depth.reshape(-1)[index] = seen.depth.numpy()
     hit = np.abs(np.where(np.isfinite(depth), depth, 0) - np.where(np.isfinite(view.depth), view.depth, 0))
@@ -92,14 +91,8 @@ def _seen_before(view: View, depth: Array, survey: Sequence[View]) -> Mask:
     with np.errstate(invalid="ignore"):
         points = (view.centre + view.directions * depth[..., None]).reshape(-1, 3)
     finite = np.all(np.isfinite(points), axis=-1)
-    points = np.where(finite[:, None], points, 0)
-    count = np.zeros(len(points), np.int16)
-    for old in survey:
-        uv, distance, inside = old.project(points)
-        front = old.lookup(old.depth, uv, inside)
-        count += inside & (np.abs(front - distance) < 2 * tolerance(old, distance, HullConfig()))
     # an empty sky is known too: nothing was ever seen there
-    return ((finite & (count > 0)) | ~finite).reshape(view.shape)
+    return (on_surface(points, survey, HullConfig()) | ~finite).reshape(view.shape)
 
 
 def _beneath(view: View, depth: Array, olds: Sequence[Old]) -> Mask:

@@ -3,30 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
 
 from refield.estimate import associate, detect, hull, light, look
 from refield.estimate.associate import AssociateConfig, Ground
-from refield.estimate.conclude import concluded
+from refield.estimate.conclude import Told, concluded
 from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.faces import changed_parts
 from refield.estimate.hull import Hull, HullConfig, Plane
 from refield.estimate.lattice import Lattice, Voxels, grown
 from refield.estimate.look import Array, View
+from refield.estimate.models import ModelConfig, Models
 from refield.estimate.objects import Old
-from refield.estimate.outline import ObjectConfig, Seeds, outline
+from refield.estimate.outline import ObjectConfig, Seeds, outline, remembered
+from refield.estimate.place import PlaceConfig, place
 from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
 from refield.field.radiance import Field
 from refield.scene.capture import Capture, Frame
-from refield.scene.change import PlacedPhoto, SceneChange
+from refield.scene.change import OccupancyGrid, PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
-from refield.vision.segmenter import GrabCutSegmenter, Segmenter
 
 OnStage = Callable[[str], None]
-_GRABCUT = GrabCutSegmenter()
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class EstimateConfig:
     """old photos that the field's own errors are learnt from"""
     most_changed: float = 0.5
     """if more of the photos' pixels changed, they do not show this scene"""
+    place: PlaceConfig = field(default_factory=PlaceConfig)
+    """the new photos' poses"""
     detect: DetectConfig = field(default_factory=DetectConfig)
     """change masks"""
     hull: HullConfig = field(default_factory=HullConfig)
@@ -51,6 +54,8 @@ class EstimateConfig:
     """refinement of poses through the field"""
     associate: AssociateConfig = field(default_factory=AssociateConfig)
     """what is believed"""
+    models: ModelConfig = field(default_factory=ModelConfig)
+    """what cuts things out and what finds corresponding points"""
 
 
 @dataclass(frozen=True)
@@ -62,9 +67,13 @@ class _Scene:
     config: EstimateConfig
     survey: tuple[View, ...]
     changed: tuple[Changed, ...]
+    photos: tuple[PlacedPhoto, ...]
+    """all of the new ones; ``changed`` goes with those that are used"""
     planes: list[Plane]
     """what holds things up"""
-    segmenter: Segmenter
+    models: Models
+    known: tuple[OccupancyGrid, ...]
+    """objects that earlier visits found, where they stood before this one"""
 
 
 def estimate_change(
@@ -73,22 +82,27 @@ def estimate_change(
     frames: Sequence[Frame],
     config: EstimateConfig = EstimateConfig(),
     on_stage: OnStage | None = None,
-    segmenter: Segmenter = _GRABCUT,
+    models: Models | None = None,
+    known: Sequence[OccupancyGrid] = (),
 ) -> SceneChange:
     """What moved, left or arrived between the capture that ``field`` was fitted to and a few new photos (§4.2).
 
     Args:
         frames: the new photos, with poses in the capture's world.
         on_stage: called with each step's name as it begins.
-        segmenter: tells things from what is behind them in the old field's pictures.
+        models: a segmenter that tells things from what is behind them in the old field's pictures, and a matcher;
+            those that the config names if not given.
+        known: shapes that earlier visits found, where the objects stood before this one: if one of them moves again,
+            it need not be segmented again (§11.3.2).
 
     Raises:
-        InputError: most of the pixels changed: the photos show another scene.
+        InputError: most of the pixels changed: the photos show another scene; or a model cannot be opened.
     """
+    models = config.models.open() if models is None else models
     say = on_stage or (lambda name: None)
-    photos = tuple(PlacedPhoto(f.name, "used", frame=f) for f in frames)
     say("detect")
-    scene = _detected(capture, field, frames, config, segmenter)
+    scene = replace(_detected(capture, field, frames, config, models), known=tuple(known))
+    photos = scene.photos
     if not any(c.mask.any() for c in scene.changed):
         return SceneChange((), photos, "no pixel differs by more than the field's own errors on the old photos")
     say("hull")
@@ -96,13 +110,13 @@ def estimate_change(
     if region is None:
         return SceneChange((), photos, "the pixels that differ agree on no place that more than one photo shows")
     carved, free = _carved(scene, region)
-    things, others = changed_parts(scene.changed, carved, free, config.hull.smallest, segmenter)
+    things, others = changed_parts(scene.changed, carved, free, config.hull.smallest, models.segmenter)
     olds = _were_there(scene, carved, things or others)
     say("pose")
     up = scene.planes[0].normal if scene.planes else _up(capture)
     ground = Ground(
         field, carved, free, up, scene.planes, scene.survey, config.detect, config.hull, config.objects,
-        config.associate, config.register, config.refine,
+        config.associate, config.register, config.refine, models.matcher,
     )  # fmt: skip
     settled = associate.settle(ground, olds, scene.changed)
     # what goes on outside of the changed pixels was hidden by something, as a rule; else it is a thing after all
@@ -111,23 +125,42 @@ def estimate_change(
     if more:
         settled = associate.settle(ground, [*olds, *more], scene.changed)
     say("segment")
-    return concluded(capture.train, scene.changed, photos, settled, carved)
+    return concluded(Told(field, capture.train, scene.changed, photos, carved), settled)
 
 
 def _detected(
-    capture: Capture, field: Field, frames: Sequence[Frame], config: EstimateConfig, segmenter: Segmenter
+    capture: Capture, field: Field, frames: Sequence[Frame], config: EstimateConfig, models: Models
 ) -> _Scene:
-    views = [look.view_of(field, f, config.max_pixels) for f in frames]
+    views = [_placed(field, f, config) for f in frames]
     survey = [look.view_of(field, f, config.max_pixels) for f in look.spread_out(capture.frames, config.survey)]
     noise = detect.survey_noise(survey, config.detect)
     changed = detect.changes(views, noise, config.detect)
-    share = float(np.mean([c.mask.mean() for c in changed]))
-    if share > config.most_changed:
-        what = f"{100 * share:.0f} % of the pixels changed; is this the same scene?"
+    shares = [float(c.mask.mean()) for c in changed]
+    photos = tuple(_verdict(v.frame, share, config.most_changed) for v, share in zip(views, shares))
+    if all(p.status == "rejected" for p in photos):
+        what = f"{100 * float(np.mean(shares)):.0f} % of the pixels changed; is this the same scene, in the same light?"
         raise InputError("new photos", what, "give photos of the scene that was trained, with poses in its world")
+    if any(p.status == "rejected" for p in photos):
+        used = [v for v, p in zip(views, photos) if p.status == "used"]
+        changed = detect.changes(used, noise, config.detect)
     planes = _planes([n.view for n in noise], changed)
     changed = light.set_light_aside(changed, planes, config.detect)
-    return _Scene(capture, field, config, tuple(n.view for n in noise), tuple(changed), planes, segmenter)
+    return _Scene(capture, field, config, tuple(n.view for n in noise), tuple(changed), photos, planes, models, ())
+
+
+def _placed(field: Field, frame: Frame, config: EstimateConfig) -> View:
+    """A new photo beside the old field's picture, from where the photo was really taken."""
+    view = look.view_of(field, frame, config.max_pixels)
+    placed = place(detect.carried(view, config.detect), config.place)
+    if placed.shift == 0:
+        return view
+    return look.view_of(field, replace(frame, world_from_cam=placed.world_from_cam), config.max_pixels)
+
+
+def _verdict(frame: Frame, share: float, most: float) -> PlacedPhoto:
+    if share <= most:
+        return PlacedPhoto(frame.name, "used", frame=frame)
+    return PlacedPhoto(frame.name, "rejected", f"{100 * share:.0f} % of its pixels changed; it shows another scene")
 
 
 def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
@@ -172,8 +205,14 @@ def _were_there(scene: _Scene, carved: Hull, parts: Sequence[Voxels], known: Seq
         at = carved.lattice.centres[part]
         if any(old.lattice.holds(grown(old.voxels, old.margin), at).mean() > 0.5 for old in (*known, *found)):
             continue
+        grid = next((g for g in scene.known if g.contains(torch.from_numpy(at)).float().mean() > 0.5), None)
+        if grid is not None:
+            old = remembered(scene.field, scene.capture.train, grid, scene.planes, config.objects)
+            if old is not None:
+                found.append(old)
+                continue
         seeds = Seeds(carved.lattice, part, carved.hull, carved.unchanged)
-        old = outline(scene.field, scene.capture.train, seeds, scene.planes, scene.segmenter, config.objects)
+        old = outline(scene.field, scene.capture.train, seeds, scene.planes, scene.models.segmenter, config.objects)
         if old is not None:
             found.append(old)
     return found

@@ -42,6 +42,8 @@ class RegisterConfig:
     """of the object's apparent diameter"""
     fine_blur: float = 0.03
     """of the object's apparent diameter"""
+    enough: float = 0.2
+    """a score that turns about the support's normal, or a guess, reach; then no other rotation is tried"""
     cap: float = 0.25
     """colour distance (in [0, 1] RGB) at which a point counts as wrong"""
 
@@ -146,23 +148,24 @@ def register(
         up: the support's normal, about which objects most often turn.
         extra: ``new_from_old`` guesses from elsewhere (matched features), tried as they are.
     """
-    views = [p.view for p in past]
     middle = cloud.points.mean(0)
     radius = float(np.sqrt(((cloud.points - middle) ** 2).sum(-1).mean()))
-    size = [2 * radius * v.camera.fx / max(float(np.linalg.norm(target.centre - v.centre)), 1e-6) for v in views]
-    rotations = np.concatenate([turns_about(up, config.turns), super_fibonacci(config.rotations)])
-    centres = np.repeat(np.asarray(target.centre, np.float64)[None], len(rotations), 0)
-    for guess in extra:
-        rotations = np.concatenate([rotations, guess[:3, :3].numpy()[None]])
-        centres = np.concatenate([centres, (guess[:3, :3].numpy() @ middle + guess[:3, 3].numpy())[None]])
+    away = [max(float(np.linalg.norm(target.centre - p.view.centre)), 1e-6) for p in past]
+    size = [2 * radius * p.view.camera.fx / d for p, d in zip(past, away)]
     search = _Search(cloud, past, target, middle, radius, size, config)
-    scores = search.run(rotations, centres, config.points, config.steps, config.coarse_blur)
-    best = _distinct(rotations, scores, config.keep, 8.0)
-    rotations, centres = rotations[best].copy(), centres[best].copy()
-    search.run(rotations, centres, 2 * config.points, 10, 0.5 * (config.coarse_blur + config.fine_blur))
-    scores = search.run(rotations, centres, len(cloud.points), 12, config.fine_blur)
-    order = _distinct(rotations, scores, 8, 3.0)
-    return [Candidate(_pose(rotations[k], centres[k], middle), float(scores[k])) for k in order]
+    likely = turns_about(up, config.turns)
+    centres = np.repeat(np.asarray(target.centre, np.float64)[None], len(likely), 0)
+    for guess in extra:
+        likely = np.concatenate([likely, guess[:3, :3].numpy()[None]])
+        centres = np.concatenate([centres, (guess[:3, :3].numpy() @ middle + guess[:3, 3].numpy())[None]])
+    found = search.best(likely, centres)
+    if found[0].score > config.enough:
+        every = super_fibonacci(config.rotations)
+        found += search.best(every, np.repeat(centres[:1], len(every), 0))
+    order = _distinct(
+        np.stack([c.new_from_old[:3, :3].numpy() for c in found]), np.array([c.score for c in found]), 8, 3.0
+    )
+    return [found[k] for k in order]
 
 
 @dataclass(frozen=True)
@@ -174,6 +177,18 @@ class _Search:
     radius: float
     size: Sequence[float]
     config: RegisterConfig
+
+    def best(self, rotations: _F64, centres: _F64) -> list[Candidate]:
+        """The best of some starting poses, improved coarse to fine, best first."""
+        c = self.config
+        rotations, centres = rotations.copy(), centres.copy()
+        scores = self.run(rotations, centres, c.points, c.steps, c.coarse_blur)
+        some = _distinct(rotations, scores, c.keep, 8.0)
+        rotations, centres = rotations[some].copy(), centres[some].copy()
+        self.run(rotations, centres, 2 * c.points, 10, 0.5 * (c.coarse_blur + c.fine_blur))
+        scores = self.run(rotations, centres, len(self.cloud.points), 12, c.fine_blur)
+        order = _distinct(rotations, scores, 8, 3.0)
+        return [Candidate(_pose(rotations[k], centres[k], self.middle), float(scores[k])) for k in order]
 
     def run(self, rotations: _F64, centres: _F64, count: int, steps: int, blur: float) -> _F64:
         """Improve the poses in place at one level of blur and score them."""

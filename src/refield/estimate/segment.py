@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from refield.estimate.carve_kernels import find_hits
 from refield.estimate.lattice import grown
 from refield.estimate.objects import Old, box_in, corners_of, patch_rays
 from refield.scene.capture import Frame
@@ -62,12 +63,8 @@ def _projected(frame: Frame, grid: OccupancyGrid) -> Tensor:
 
 def meets(grid: OccupancyGrid, origins: Tensor, directions: Tensor, steps: int = 40) -> Tensor:
     """Whether rays pass through the grid's inside, (N,) bool."""
-    lo, hi = grid.tight_aabb()
-    inverse = 1 / torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
-    a, b = (lo - origins) * inverse, (hi - origins) * inverse
-    near, far = torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)
-    out = far > near
-    hit = out.nonzero()[:, 0]
-    t = near[hit, None] + (far - near)[hit, None] * (torch.arange(steps) + 0.5) / steps
-    out[hit] = grid.contains(origins[hit, None] + directions[hit, None] * t[..., None]).any(1)
+    out = torch.zeros(len(origins), dtype=torch.bool)
+    rays = origins.contiguous().numpy(), directions.contiguous().numpy()
+    values, box, tight = grid.values.contiguous(), grid.aabb.double(), grid.tight_aabb().double()
+    find_hits(*rays, values.numpy(), box.numpy(), tight.numpy(), steps, out.numpy())
     return out

@@ -111,7 +111,8 @@ def summary(change: SceneChange) -> str:
     rejected = len(change.photos) - used
     photos = f"{used} new photo{'' if used == 1 else 's'}" + (f" ({rejected} rejected)" if rejected else "")
     if not change.objects:
-        return f"Nothing changed; seen in {photos}."
+        what = "Something changed that is not understood" if change.unexplained else "Nothing changed"
+        return f"{what}; seen in {photos}."
     kinds = Counter(o.kind for o in change.objects)
     parts = ", ".join(f"{kinds[k]} {k}" for k in ("moved", "removed", "added") if kinds[k])
     n = len(change.objects)

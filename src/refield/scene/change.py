@@ -113,7 +113,7 @@ class ObjectChange:
     """(6, 6) float64 of the twist (world units, radians; about the world's origin) that left-multiplies
     ``new_from_old``."""
     note: str = ""
-    """What the user should know: an unobservable turn, a weak match."""
+    """Why it is believed, and what the user should know: an unobservable turn, a weak match."""
 
     def __post_init__(self) -> None:
         if (self.kind == "moved") != (self.new_from_old is not None):
@@ -160,6 +160,8 @@ class SceneChange:
     """Per used photo, (H, W) bool: all changed pixels showing what is there now."""
     masks_out: tuple[Tensor, ...] = field(default=())
     """Per used photo, (H, W) bool: all changed pixels where something used to be."""
+    unexplained: tuple[Tensor, ...] = field(default=())
+    """Per used photo, (H, W) bool: changed pixels that nothing of what is said here explains; empty if they are few."""
 
     @property
     def frames(self) -> tuple[Frame, ...]:

@@ -39,6 +39,7 @@ def save_change(folder: Path, change: SceneChange) -> None:
     record: dict[str, Any] = {"objects": objects, "photos": photos, "why": change.why}
     record["masks_in"] = _masks_out(folder, "photos_in", change.masks_in)
     record["masks_out"] = _masks_out(folder, "photos_out", change.masks_out)
+    record["unexplained"] = _masks_out(folder, "photos_unexplained", change.unexplained)
     write_json(folder / NAME, record)
 
 
@@ -59,6 +60,7 @@ def load_change(folder: Path, capture: Capture | None = None, *, photos: Sequenc
             why=str(record.get("why", "")),
             masks_in=tuple(m for m in _masks_in(folder, record.get("masks_in", [])) if m is not None),
             masks_out=tuple(m for m in _masks_in(folder, record.get("masks_out", [])) if m is not None),
+            unexplained=tuple(m for m in _masks_in(folder, record.get("unexplained", [])) if m is not None),
         )
     except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else f"is not a change ({error})"

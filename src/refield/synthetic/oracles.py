@@ -21,8 +21,9 @@ from refield.field.sampling import OccupancySampler
 from refield.scene.camera import Camera
 from refield.scene.capture import Rays
 from refield.scene.pose import invert, transform
+from refield.synthetic.placing import FLOOR_HALF
+from refield.synthetic.state import Item, State
 from refield.synthetic.visibility import Hits, first_hits, view_hits
-from refield.synthetic.worlds import FLOOR_HALF, Item, State
 
 
 class AnalyticField:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from refield.scene.camera import Camera
 from refield.scene.errors import InputError
+from refield.synthetic.state import Item, State
 from refield.synthetic.textures import to_linear, to_srgb
-from refield.synthetic.worlds import Item, State
 
 _OLDEST_LLVM = 19  # an older one aborts the whole process on the first kernel
 _DEPTH = 5  # light path segments
@@ -90,8 +90,10 @@ def _mesh(mi: Any, item: Item) -> Any:
 
 def _surface(mi: Any, item: Item) -> dict[str, Any]:
     paint = {"type": "bitmap", "bitmap": mi.Bitmap(to_linear(item.texture)), "raw": True}
+    if item.metal:
+        return {"type": "roughconductor", "material": "none", "specular_reflectance": paint, "alpha": item.roughness}
     if item.glossy:
-        return {"type": "roughplastic", "diffuse_reflectance": paint, "alpha": 0.35}
+        return {"type": "roughplastic", "diffuse_reflectance": paint, "alpha": item.roughness}
     return {"type": "diffuse", "reflectance": paint}
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from refield.scene.camera import Camera
 from refield.scene.capture import Rays, camera_rays
 from refield.scene.pose import invert, rotate, transform
-from refield.synthetic.worlds import State
+from refield.synthetic.state import State
 
 
 @dataclass(frozen=True)

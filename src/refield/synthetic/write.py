@@ -24,8 +24,9 @@ from refield.scene.images import write_image
 from refield.scene.transforms_json import save_transforms
 from refield.synthetic.cameras import hemisphere, ring, square_camera
 from refield.synthetic.pathtrace import PathTracer
+from refield.synthetic.state import State, TrueChange, World
 from refield.synthetic.visibility import silhouette, view_hits
-from refield.synthetic.worlds import WORLDS, State, TrueChange, World
+from refield.synthetic.worlds import WORLDS
 
 Progress = Callable[[int, int], None]
 """Called with the pictures done and their number."""
@@ -80,18 +81,9 @@ def photograph(world: World, out: Path, config: SynthConfig, on_progress: Progre
 
     def shoot(folder: str, state: State, poses: Sequence[Tensor]) -> Capture:
         nonlocal done
-        tracer, frames = PathTracer(state), []
-        for i, pose in enumerate(poses):
-            path = out / folder / "images" / f"{i:04d}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_image(path, tracer.photo(camera, pose, config.spp, config.seed * 100_003 + done))
-            frames.append(Frame(path, camera, f"images/{path.name}", pose))
-            done += 1
-            if on_progress is not None:
-                on_progress(done, total)
-        capture = Capture(tuple(frames))
-        save_transforms(out / folder / "transforms.json", capture)
-        return capture
+        first, done = done, done + len(poses)
+        tell = None if on_progress is None else lambda k: on_progress(first + k, total)
+        return shoot_state(state, out / folder, (camera, poses), (config.spp, config.seed * 100_003 + first), tell)
 
     before = shoot("before", world.before, old)
     after = shoot("after", world.after, new[0::2])
@@ -100,6 +92,34 @@ def photograph(world: World, out: Path, config: SynthConfig, on_progress: Progre
         _write_masks(world, out / folder, capture)
     (out / "truth").mkdir(exist_ok=True)
     save_change(out / "truth", true_change(world, before, after.frames))
+
+
+def shoot_state(
+    state: State,
+    folder: Path,
+    cameras: tuple[Camera, Sequence[Tensor]],
+    paths: tuple[int, int] = (64, 0),
+    on_photo: Callable[[int], None] | None = None,
+) -> Capture:
+    """Photograph a state into a capture's folder (transforms.json, images/).
+
+    Args:
+        cameras: the camera, and where it stands: ``world_from_cam`` (4, 4) each.
+        paths: light paths a pixel, and the seed of the first photo's.
+        on_photo: called with the number of photos done.
+    """
+    (camera, poses), (spp, seed) = cameras, paths
+    tracer, frames = PathTracer(state), []
+    for i, pose in enumerate(poses):
+        path = folder / "images" / f"{i:04d}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_image(path, tracer.photo(camera, pose, spp, seed + i))
+        frames.append(Frame(path, camera, f"images/{path.name}", pose))
+        if on_photo is not None:
+            on_photo(i + 1)
+    capture = Capture(tuple(frames))
+    save_transforms(folder / "transforms.json", capture)
+    return capture
 
 
 def true_change(world: World, before: Capture, frames: Sequence[Frame]) -> SceneChange:

@@ -6,12 +6,14 @@ Pixels follow the project's convention: the top-left pixel's centre is (0.5, 0.5
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+_KEPT_BELOW = 1_000_000  # bytes
 Matches = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
@@ -37,7 +39,12 @@ class SiftMatcher:
     """SIFT's contrast threshold"""
 
     def features(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """(H, W, 3) uint8 -> keypoints (K, 2) px and their root-SIFT descriptors (K, 128)."""
+        """(H, W, 3) uint8 -> keypoints (K, 2) px and their root-SIFT descriptors (K, 128); small images' are kept."""
+        if image.size > _KEPT_BELOW:
+            return self._features(image)
+        return _known_features(self, image.tobytes(), image.shape)
+
+    def _features(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         scale = self.enlarge if image.shape[0] * image.shape[1] < self.enlarge_below else 1.0
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if scale != 1.0:
@@ -51,14 +58,7 @@ class SiftMatcher:
 
     def match(self, image_a: NDArray[np.uint8], image_b: NDArray[np.uint8]) -> Matches:
         """See `Matcher.match`."""
-        return self.match_features(self.features(image_a), self.features(image_b))
-
-    def match_features(
-        self,
-        a: tuple[NDArray[np.float64], NDArray[np.float32]],
-        b: tuple[NDArray[np.float64], NDArray[np.float32]],
-    ) -> Matches:
-        """The same from features already found; what follows a point's two pixel coordinates goes along with it."""
+        a, b = self.features(image_a), self.features(image_b)
         if min(len(a[0]), len(b[0])) < 2:
             return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
         similar = a[1] @ b[1].T
@@ -71,3 +71,10 @@ class SiftMatcher:
         keep = mutual & (best < self.ratio * second)
         score = 1 - best[keep] / np.maximum(second[keep], 1e-9)
         return a[0][keep], b[0][nearest[keep]], score
+
+
+@lru_cache(maxsize=128)  # an object's pictures are each matched with several others
+def _known_features(
+    matcher: SiftMatcher, image: bytes, shape: tuple[int, ...]
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    return matcher._features(np.frombuffer(image, np.uint8).reshape(shape))

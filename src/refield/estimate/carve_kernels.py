@@ -1,0 +1,226 @@
+"""The hot loops of carving: points against views, rays against a shape, voxels against their neighbours (numba).
+
+Letters: N points (N, 3) in the world, V windows, P pixels of all windows together. A window is a rectangle of a view
+and how far away the old field's surface is in it, known by 26 numbers: cam_from_world R (9) and t (3), fx fy cx cy,
+k1 k2 p1 p2 k3, the rectangle x0 y0 x1 y1 in pixels, and the place of its first pixel among P. Depths are along unit
+rays, inf where the field is empty; ``slack`` (V,) is how far from a surface a point may be and still be on it, per unit
+of its distance. Every loop is parallel over what it writes, so results do not depend on the threads.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from refield.scene.camera import Camera
+
+_F32 = NDArray[Any]
+_F64 = NDArray[Any]
+_Bool = NDArray[Any]
+_Count = NDArray[Any]
+# not all of fastmath: depths may be infinite and points not numbers
+_JIT: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "cache": True, "error_model": "numpy"}
+
+
+class Window(NamedTuple):
+    """A rectangle of a view."""
+
+    camera: Camera
+    world_from_cam: Tensor
+    depth: _F32
+    """(h, w)"""
+    corner: tuple[int, int] = (0, 0)
+    """x0, y0 in the camera's pixels"""
+
+
+def packed(windows: Iterable[Window]) -> tuple[_F64, _F32]:
+    """What the kernels know windows by: (V, 26) numbers and (P,) float32 depths."""
+    rows, depths, start = [], [np.zeros(0, np.float32)], 0
+    for w in windows:
+        m, c = w.world_from_cam.numpy(), w.camera
+        r = m[:3, :3].T
+        (h, wide), (x0, y0) = w.depth.shape, w.corner
+        lens = (c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3)
+        rows.append([*r.ravel(), *(-r @ m[:3, 3]), *lens, x0, y0, x0 + wide, y0 + h, start])
+        depths.append(w.depth.ravel())
+        start += w.depth.size
+    return np.array(rows, np.float64).reshape(-1, 26), np.concatenate(depths, dtype=np.float32)
+
+
+@njit(**_JIT)
+def _look(lens: _F64, x: float, y: float, z: float) -> tuple[int, float]:
+    """A world point -> the pixel it falls on, counted among P (-1: on none), and its distance."""
+    zc = lens[6] * x + lens[7] * y + lens[8] * z + lens[11]
+    if not zc > 1e-6:
+        return -1, 0.0
+    xc = lens[0] * x + lens[1] * y + lens[2] * z + lens[9]
+    yc = lens[3] * x + lens[4] * y + lens[5] * z + lens[10]
+    a, b = xc / zc, yc / zc
+    r2 = a * a + b * b
+    radial = 1 + r2 * (lens[16] + r2 * (lens[17] + r2 * lens[20]))
+    u = lens[12] * (a * radial + 2 * lens[18] * a * b + lens[19] * (r2 + 2 * a * a)) + lens[14]
+    v = lens[13] * (b * radial + lens[18] * (r2 + 2 * b * b) + 2 * lens[19] * a * b) + lens[15]
+    if not (u >= lens[21] and v >= lens[22] and u < lens[23] and v < lens[24]):
+        return -1, 0.0
+    row, column = int(v) - int(lens[22]), int(u) - int(lens[21])
+    pixel = int(lens[25]) + row * (int(lens[23]) - int(lens[21])) + column
+    return pixel, math.sqrt(xc * xc + yc * yc + zc * zc)
+
+
+@njit(parallel=True, **_JIT)
+def count_votes(
+    points: _F32, lenses: _F64, depths: _F32, slack: _F64, masks: _Bool, shown: _Count, against: _Count
+) -> None:
+    """Add to ``shown`` (N,) the windows whose mask holds each point, to ``against`` (N,) those that see it outside of
+    their mask, with no old surface before it. masks: (P,).
+    """
+    for n in prange(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        for v in range(len(lenses)):
+            at, distance = _look(lenses[v], x, y, z)
+            if at >= 0:
+                if masks[at]:
+                    shown[n] += 1
+                elif distance < depths[at] + slack[v] * distance:
+                    against[n] += 1
+
+
+@njit(parallel=True, **_JIT)
+def find_behind(points: _F32, lenses: _F64, depths: _F32, slack: _F64, through: _Bool, behind: _F32) -> None:
+    """``through`` (N,): whether some window looks through a point; ``behind`` (N,): how far behind the surface it is in
+    the window that comes nearest to it, inf if none shows a surface there."""
+    for n in prange(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        passed, least = False, np.inf
+        for v in range(len(lenses)):
+            at, distance = _look(lenses[v], x, y, z)
+            if at >= 0:
+                front = depths[at]
+                passed |= distance < front - slack[v] * distance
+                if front < np.inf:
+                    least = min(least, distance - front)
+        through[n], behind[n] = passed, least
+
+
+@njit(parallel=True, **_JIT)
+def find_on_surface(points: _F32, lenses: _F64, depths: _F32, slack: _F64, out: _Bool) -> None:
+    """``out`` (N,): whether a point lies on the surface that some window shows."""
+    for n in prange(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        for v in range(len(lenses)):
+            at, distance = _look(lenses[v], x, y, z)
+            if at >= 0 and abs(depths[at] - distance) < slack[v] * distance:
+                out[n] = True
+                break
+
+
+@njit(parallel=True, **_JIT)
+def find_solid(
+    points: _F32, lenses: _F64, depths: _F32, margin: float, allowed: float, deepest: float, out: _Bool
+) -> None:
+    """``out`` (N,): whether at most ``allowed`` windows look through a point, with their surface more than ``margin``
+    behind it, and it is less than ``deepest`` behind the surface in some window."""
+    for n in prange(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        passed, least = 0, np.inf
+        for v in range(len(lenses)):
+            at, distance = _look(lenses[v], x, y, z)
+            if at >= 0:
+                behind = distance - depths[at]
+                passed += behind < -margin
+                least = min(least, behind)
+                if passed > allowed:
+                    break
+        out[n] = passed <= allowed and least < deepest
+
+
+@njit(**_JIT)
+def _cell(x: float, low: float, high: float, nodes: int) -> tuple[int, float]:
+    """Along one axis: the node below a place, and the part of the way to the next; node -1 outside."""
+    at = (x - low) / (high - low) * (nodes - 1)
+    if not (at >= 0 and at <= nodes - 1):
+        return -1, 0.0
+    node = min(int(at), nodes - 2)
+    return node, at - node
+
+
+@njit(**_JIT)
+def _inside(values: _F32, box: _F64, x: float, y: float, z: float) -> bool:
+    """Whether the trilinear value at a place is above one half, as `OccupancyGrid.contains`."""
+    i, a = _cell(x, box[0, 0], box[1, 0], values.shape[0])
+    j, b = _cell(y, box[0, 1], box[1, 1], values.shape[1])
+    k, c = _cell(z, box[0, 2], box[1, 2], values.shape[2])
+    if i < 0 or j < 0 or k < 0:
+        return False
+    value = 0.0
+    for p in range(2):
+        for q in range(2):
+            part = (a if p else 1 - a) * (b if q else 1 - b)
+            value += part * (values[i + p, j + q, k] * (1 - c) + values[i + p, j + q, k + 1] * c)
+    return value > 0.5
+
+
+@njit(parallel=True, **_JIT)
+def find_hits(origins: _F32, directions: _F32, values: _F32, box: _F64, tight: _F64, steps: int, out: _Bool) -> None:
+    """``out`` (N,): whether rays pass through a grid's inside at one of ``steps`` places along their way through the
+    box ``tight`` (2, 3). values (X, Y, Z), whose corner nodes are at the corners of ``box`` (2, 3)."""
+    for n in prange(len(origins)):
+        near, far = 0.0, np.inf
+        for axis in range(3):
+            along = float(directions[n, axis])
+            along = along if abs(along) >= 1e-9 else 1e-9
+            first, last = (tight[0, axis] - origins[n, axis]) / along, (tight[1, axis] - origins[n, axis]) / along
+            near, far = max(near, min(first, last)), min(far, max(first, last))
+        if not far > near:
+            continue
+        for step in range(steps):
+            t = near + (far - near) * (step + 0.5) / steps
+            x = origins[n, 0] + directions[n, 0] * t
+            y = origins[n, 1] + directions[n, 1] * t
+            if _inside(values, box, x, y, origins[n, 2] + directions[n, 2] * t):
+                out[n] = True
+                break
+
+
+@njit(parallel=True, **_JIT)
+def find_held(points: _F32, voxels: _Bool, low: _F32, cell: float, out: _Bool) -> None:
+    """``out`` (N,): whether a point lies in one of the voxels (X, Y, Z), of which the first has its centre at ``low``."""
+    nx, ny, nz = voxels.shape
+    for n in prange(len(points)):
+        i = (points[n, 0] - low[0]) / cell + 0.5
+        j = (points[n, 1] - low[1]) / cell + 0.5
+        k = (points[n, 2] - low[2]) / cell + 0.5
+        if i >= 0 and j >= 0 and k >= 0 and i < nx and j < ny and k < nz:
+            out[n] = voxels[int(i), int(j), int(k)]
+
+
+@njit(parallel=True, **_JIT)
+def spread(voxels: _Bool, steps: int, out: _Bool) -> None:
+    """Voxels (X, Y, Z) and all that are at most ``steps`` from one along every axis -> out, false at first."""
+    nx, ny, nz = voxels.shape
+    slabs = np.zeros(nx, np.bool_)
+    flat = np.zeros((nx, ny, nz), np.bool_)
+    for i in prange(nx):  # one axis after the other: the last two within a slab, then across slabs
+        for j in range(ny):
+            if not voxels[i, j].any():
+                continue
+            slabs[i] = True
+            row = np.zeros(nz, np.bool_)
+            for k in range(nz):
+                if voxels[i, j, k]:
+                    row[max(k - steps, 0) : k + steps + 1] = True
+            for other in range(max(j - steps, 0), min(j + steps + 1, ny)):
+                for k in range(nz):
+                    flat[i, other, k] |= row[k]
+    for i in prange(nx):
+        for other in range(max(i - steps, 0), min(i + steps + 1, nx)):
+            if slabs[other]:
+                for j in range(ny):
+                    for k in range(nz):
+                        out[i, j, k] |= flat[other, j, k]

@@ -1,0 +1,223 @@
+"""A moved object as a layer over what the old field shows without it, in every new photo, and how it slides.
+
+The object's own samples of the old field, moved by T, over a background that T does not change. Its change with T is
+that the layer slides over the image: a hash grid's own gradients oscillate, those of its pictures do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from torch import Tensor
+
+from refield.estimate.alone import object_alone, sampler_around
+from refield.estimate.explain import Compared
+from refield.estimate.look import Hidden, load_photo, see
+from refield.estimate.objects import Old, box_in, patch_rays
+from refield.estimate.past import Past
+from refield.field.radiance import Field
+from refield.field.sampling import OccupancySampler
+from refield.scene.camera import Camera
+from refield.scene.capture import Rays
+from refield.scene.pose import exp, invert, rigid, skew, transform
+
+_MARGIN = 5  # pixels around the object that are compared too
+
+
+@dataclass(frozen=True)
+class Sight:
+    """An object, and the photos that may show where it is now."""
+
+    field: Field
+    old: Old
+    past: Sequence[Past]
+    olds: Sequence[Old]
+    """all objects that are taken out of the old field"""
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A rectangle of one new photo around the object's new place."""
+
+    photo_index: int
+    """which of the photos"""
+    camera: Camera
+    """the photo's, scaled"""
+    box: tuple[int, int, int, int]
+    """x0, y0, x1, y1 in pixels of ``camera``"""
+    world_from_cam: Tensor
+    rays: Rays
+    photo: Tensor
+    """(n, 3)"""
+    known: Tensor
+    """(n,) whether what is behind was seen by old photos"""
+    threshold: Tensor
+    """(n,) Lab units"""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.box[3] - self.box[1], self.box[2] - self.box[0]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """The composite in one crop."""
+
+    rgb: Tensor
+    """(n, 3) the composite"""
+    own: Tensor
+    """(n, 3) the object's own part of it, premultiplied"""
+    opacity: Tensor
+    depth: Tensor
+    behind: Tensor
+    """(n, 3) what the old field shows without the objects"""
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Composites of one object over the new photos, as a function of T."""
+
+    sight: Sight
+    crops: tuple[Crop, ...]
+    pixel: float
+    """world size of a pixel at the object"""
+
+    @property
+    def old(self) -> Old:
+        return self.sight.old
+
+    @property
+    def apparent(self) -> float:
+        """The object's radius in pixels."""
+        return self.old.radius / self.pixel
+
+    @cached_property
+    def centre(self) -> Tensor:
+        return torch.from_numpy(self.old.centre).double()
+
+    @cached_property
+    def _sizes(self) -> list[int]:
+        return [len(c.rays) for c in self.crops]
+
+    @cached_property
+    def _rays(self) -> Rays:
+        return Rays(*(torch.cat([getattr(c.rays, n) for c in self.crops]) for n in ("origins", "directions")))
+
+    @cached_property
+    def _sampler(self) -> OccupancySampler:
+        return sampler_around(self.sight.field, self.old)
+
+    @cached_property
+    def _behind(self) -> tuple[Tensor, Tensor]:
+        """Colour (N, 3) and depth (N,) without the objects."""
+        seen = see(self.sight.field, self._rays, Hidden(tuple(o.haze for o in self.sight.olds)))
+        return seen.rgb, seen.depth
+
+    def show(self, new_from_old: Tensor) -> list[Layer]:
+        """The moved object over the fixed background, per crop (Eqs. 1, 3)."""
+        alone = object_alone(self.sight.field, self.old, self._rays, new_from_old, self._sampler)
+        behind, beyond = self._behind
+        front = ((beyond - alone.depth) > -self.pixel * 2) & (alone.opacity > 0.02)
+        opacity = torch.where(front, alone.opacity, torch.zeros_like(alone.opacity))
+        own = torch.where(front[:, None], alone.rgb, torch.zeros_like(alone.rgb))
+        rgb = own + (1 - opacity)[:, None] * behind
+        parts = (t.split(self._sizes) for t in (rgb, own, opacity, alone.depth, behind))
+        return [Layer(*p) for p in zip(*parts)]
+
+    def sides(self, crop: Crop, shown: Layer, new_from_old: Tensor) -> NDArray[np.int64]:
+        """The side of the object at each pixel (n,); -1 where it is not, or no old photo saw what is there."""
+        out = np.full(len(shown.depth), -1)
+        solid = (shown.opacity > 0.8) & torch.isfinite(shown.depth)
+        x = crop.rays.origins[solid] + crop.rays.directions[solid] * shown.depth[solid, None]
+        out[solid.numpy()] = self.old.side_of(transform(invert(new_from_old), x).numpy())
+        return out
+
+    def compared(self, new_from_old: Tensor) -> list[Compared]:
+        """What `explained` asks for, per crop."""
+        before = see(self.sight.field, self._rays).rgb.split(self._sizes)
+        out = []
+        for crop, shown, old in zip(self.crops, self.show(new_from_old), before):
+            photo, composite, unchanged = (t.reshape(*crop.shape, 3).numpy() for t in (crop.photo, shown.rgb, old))
+            sides = self.sides(crop, shown, new_from_old).reshape(crop.shape)
+            threshold = crop.threshold.reshape(crop.shape).numpy()
+            out.append(Compared(photo, composite, unchanged, threshold, sides))
+        return out
+
+    def flow(self, crop: Crop, shown: Layer, new_from_old: Tensor) -> Tensor:
+        """Change of the composite with a twist about its centre, (n, 3, 6): its layer slides over the photo."""
+        h, w = crop.shape
+        alpha, layer = shown.opacity.reshape(h, w).numpy(), shown.own.reshape(h, w, 3).numpy()
+        seen = shown.depth.reshape(h, w).numpy()
+        # beyond the outline the layer slides along with its nearest pixel
+        _, nearest = ndimage.distance_transform_edt(~((alpha > 0.5) & np.isfinite(seen)), return_indices=True)
+        depth = torch.from_numpy(seen[nearest[0], nearest[1]].reshape(-1)).double()
+        depth = torch.where(torch.isfinite(depth), depth, torch.ones_like(depth))
+        x = crop.rays.origins.double() + crop.rays.directions.double() * depth[:, None]
+        per_point = _pixel_slopes(crop, x)
+        per_twist = torch.cat([per_point, per_point @ -skew(x - transform(new_from_old, self.centre))], -1)
+        dv, du = np.gradient(np.concatenate([layer, alpha[..., None]], -1), axis=(0, 1))
+        slope = torch.from_numpy(np.stack([du, dv], -1).reshape(h * w, 4, 2)).double()
+        slid = -slope @ per_twist
+        return (slid[:, :3] - slid[:, 3:] * shown.behind[:, :, None]).float()
+
+    def moved(self, new_from_old: Tensor, twist: Tensor) -> Tensor:
+        """T turned and shifted by a twist about the object's current centre."""
+        c = transform(new_from_old, self.centre)
+        shift = rigid(torch.eye(3, dtype=torch.float64), c)
+        return shift @ exp(twist) @ invert(shift) @ new_from_old
+
+
+def layers(sight: Sight, start: Tensor, rays: int) -> Layers:
+    """The photos around the place where ``start`` (4, 4) puts the object, scaled down to ``rays`` in all."""
+    corners = transform(start, torch.cartesian_prod(*sight.old.grid.tight_aabb().T.double())).numpy()
+    boxes = [(p, box_in(p.view.frame.camera, p.view.frame, corners, _MARGIN)) for p in sight.past]
+    total = sum((b[2] - b[0]) * (b[3] - b[1]) for _, b in boxes if b is not None)
+    shrink = min(1.0, (rays / max(total, 1)) ** 0.5)
+    crops, footprint = [], []
+    for k, (p, full) in enumerate(boxes):
+        if full is None:
+            continue
+        c = p.view.frame.camera
+        camera = c if shrink == 1 else c.scaled(max(1, round(c.width * shrink)), max(1, round(c.height * shrink)))
+        box = box_in(camera, p.view.frame, corners, _MARGIN)
+        if box is not None:
+            crops.append(_crop(k, p, camera, box))
+            footprint.append(float(np.linalg.norm(corners.mean(0) - p.view.centre)) / camera.fx)
+    return Layers(sight, tuple(crops), float(np.median(footprint)) if footprint else 1e-3)
+
+
+def _crop(index: int, p: Past, camera: Camera, box: tuple[int, int, int, int]) -> Crop:
+    x0, y0, x1, y1 = box
+    fit = p.view.colour_fit
+    photo = np.clip(load_photo(p.view.frame, camera)[y0:y1, x0:x1] * fit[0] + fit[1], 0, 1).astype(np.float32)
+    h, w = p.view.shape
+    rows = ((np.arange(y0, y1) + 0.5) * h / camera.height).astype(int)
+    cols = ((np.arange(x0, x1) + 0.5) * w / camera.width).astype(int)
+    pick = np.ix_(rows, cols)
+    return Crop(
+        index,
+        camera,
+        box,
+        p.view.frame.world_from_cam,
+        patch_rays(camera, p.view.frame, box),
+        torch.from_numpy(photo.reshape(-1, 3)),
+        torch.from_numpy(p.known[pick].reshape(-1)),
+        torch.from_numpy(p.changed.threshold[pick].reshape(-1)),
+    )
+
+
+def _pixel_slopes(crop: Crop, x: Tensor) -> Tensor:
+    """d(u, v) / d(world point), (n, 2, 3), the lens' distortion left out."""
+    m = crop.world_from_cam
+    p = (x - m[:3, 3]) @ m[:3, :3]
+    z = p[:, 2].clamp_min(1e-6)
+    zero = torch.zeros_like(z)
+    u = torch.stack([crop.camera.fx / z, zero, -crop.camera.fx * p[:, 0] / z**2], -1)
+    v = torch.stack([zero, crop.camera.fy / z, -crop.camera.fy * p[:, 1] / z**2], -1)
+    return torch.stack([u, v], 1) @ m[:3, :3].T

@@ -1,0 +1,172 @@
+"""The kernels of carving against the same in plain numpy, torch and scipy, at double precision."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from refield.estimate.hull import HullConfig, look_behind, on_surface, votes
+from refield.estimate.lattice import Lattice, grown
+from refield.estimate.look import View
+from refield.estimate.objects import Patch
+from refield.estimate.outline import carve_solid
+from refield.estimate.segment import meets
+from refield.scene.camera import Camera
+from refield.scene.capture import Frame
+from refield.scene.change import OccupancyGrid
+from tests.estimate.boxes import camera_at
+
+CONFIG = HullConfig(surface=8.0)
+LENSES = [
+    Camera(40, 30, 33.0, 35.0, 19.0, 16.0, 0.1, -0.03, 0.01, -0.02, 0.01),
+    Camera(24, 36, 30.0, 30.0, 12.0, 18.0, -0.2, 0.05),
+    Camera(32, 32, 40.0, 40.0, 16.0, 16.0),
+]
+
+
+def frame_of(k, tmp_path):
+    return Frame(tmp_path / f"{k}.png", LENSES[k], f"{k}.png", camera_at(110 * k, 20 + 15 * k, 1.2))
+
+
+def depth_of(shape, rng):
+    """Surfaces around the middle of the world, and a part where the field is empty."""
+    return np.where(rng.random(shape) < 0.2, np.inf, rng.uniform(0.6, 1.8, shape)).astype(np.float32)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def views(tmp_path, rng):
+    out = []
+    for k, camera in enumerate(LENSES):
+        shape = (camera.height, camera.width)
+        blank = np.zeros((*shape, 3), np.float32)
+        out.append(View(frame_of(k, tmp_path), camera, blank, blank, depth_of(shape, rng), np.zeros(shape)))
+    return out
+
+
+@pytest.fixture
+def points(rng):
+    """In view, beside it, behind the cameras, at one, and nowhere."""
+    cloud = rng.uniform(-2, 2, (20_000, 3))
+    cloud[::2] *= 0.3
+    odd = [[np.nan, 0, 0], [np.inf, 0, 0], [0, -np.inf, np.inf], [1e30, 0, 0], camera_at(0, 20, 1.2)[:3, 3].tolist()]
+    return np.concatenate([cloud, odd]).astype(np.float32)
+
+
+def looked_at(frame, camera, points):
+    """Pixels (N, 2), whether in the image, and distances, as the kernels should find them."""
+    m = frame.world_from_cam
+    local = (torch.from_numpy(points).double() - m[:3, 3]) @ m[:3, :3]
+    uv, z = camera.project(local)
+    size = torch.tensor([camera.width, camera.height])
+    inside = (z > 1e-6) & (uv >= 0).all(-1) & (uv < size).all(-1)
+    pixel = torch.where(inside[:, None], uv, torch.zeros_like(uv)).floor().long()
+    return pixel.numpy(), inside.numpy(), local.norm(dim=-1).numpy()
+
+
+def seen_by(view, points, image):
+    pixel, inside, distance = looked_at(view.frame, view.camera, points)
+    depth, value = (a[pixel[:, 1], pixel[:, 0]] for a in (view.depth, image))
+    return inside, distance, depth, value, CONFIG.surface * view.pixel_angle * distance
+
+
+def test_votes_are_counted(views, points, rng):
+    masks = [rng.random(v.shape) < 0.5 for v in views]
+    inside, against = votes(points, list(zip(views, masks)), CONFIG)
+    shown, denied = np.zeros(len(points), int), np.zeros(len(points), int)
+    for view, mask in zip(views, masks):
+        seen, distance, front, marked, slack = seen_by(view, points, mask)
+        shown += seen & marked
+        denied += seen & ~marked & (distance < front + slack)
+    assert set(shown) == set(denied) == {0, 1, 2, 3}
+    np.testing.assert_array_equal(inside, shown)
+    np.testing.assert_array_equal(against, denied)
+
+
+def test_what_is_behind_a_surface_is_measured_where_it_is_least(views, points):
+    through, behind = look_behind(points, views, CONFIG)
+    passed, least = np.zeros(len(points), bool), np.full(len(points), np.inf)
+    for view in views:
+        seen, distance, front, _, slack = seen_by(view, points, view.depth)
+        passed |= seen & (distance < front - slack)
+        least = np.minimum(least, np.where(seen & np.isfinite(front), distance - front, np.inf))
+    assert 0.1 < passed.mean() < 0.9 and 0.1 < np.isinf(least).mean() < 0.9
+    np.testing.assert_array_equal(through, passed)
+    np.testing.assert_allclose(behind, least, atol=1e-6)
+
+
+def test_points_on_a_surface_are_found(views, points):
+    found = np.zeros(len(points), bool)
+    for view in views:
+        seen, distance, front, _, slack = seen_by(view, points, view.depth)
+        found |= seen & (np.abs(front - distance) < 2 * slack)
+    assert 0.1 < found.mean() < 0.9
+    np.testing.assert_array_equal(on_surface(points, views, CONFIG), found)
+
+
+def test_without_views_nothing_is_known(points):
+    assert not any(a.any() for a in votes(points, [], CONFIG))
+    through, behind = look_behind(points, [], CONFIG)
+    assert not through.any() and np.isinf(behind).all()
+    assert not on_surface(points, [], CONFIG).any()
+
+
+@pytest.mark.parametrize(("through", "deepest"), [(0.0, 0.3), (0.4, 0.1), (1.0, 9.0)])
+def test_the_solid_is_carved_by_rectangles_of_views(tmp_path, rng, through, deepest):
+    boxes = [(5, 3, 38, 28), (0, 10, 24, 36), (8, 8, 30, 20)]
+    patches = []
+    for k, (x0, y0, x1, y1) in enumerate(boxes):
+        depth = depth_of((y1 - y0, x1 - x0), rng)
+        patches.append(Patch(frame_of(k, tmp_path), LENSES[k], boxes[k], np.zeros((*depth.shape, 3)), depth))
+    lattice = Lattice.over(np.full(3, -0.7, np.float32), np.array([0.8, 0.6, 0.9], np.float32), 30)
+    points = lattice.centres.reshape(-1, 3)
+    passed, least = np.zeros(len(points)), np.full(len(points), np.inf)
+    for patch in patches:
+        x0, y0, x1, y1 = patch.box
+        pixel, inside, distance = looked_at(patch.frame, patch.camera, points)
+        inside &= ((pixel >= (x0, y0)) & (pixel < (x1, y1))).all(-1)
+        pixel = np.where(inside[:, None], pixel - (x0, y0), 0)
+        behind = np.where(inside, distance - patch.depth[pixel[:, 1], pixel[:, 0]], np.inf)
+        passed += behind < -0.75 * lattice.cell
+        least = np.minimum(least, behind)
+    expected = ((passed <= through * len(patches)) & (least < deepest)).reshape(lattice.shape)
+    assert 0 < expected.sum() < expected.size
+    np.testing.assert_array_equal(carve_solid(lattice, patches, through, deepest), expected)
+    assert not carve_solid(lattice, [], through, deepest).any()
+
+
+def test_rays_that_meet_a_shape(rng):
+    values = ndimage.gaussian_filter(rng.standard_normal((14, 9, 11)), 1.5).astype(np.float32)
+    grid = OccupancyGrid(
+        torch.tensor([[-0.5, -0.3, 0.1], [0.4, 0.5, 0.8]]), torch.from_numpy(values / values.max() / 2 + 0.4)
+    )
+    origins = torch.from_numpy(rng.uniform(-1.5, 1.5, (4000, 3)).astype(np.float32))
+    aim = torch.from_numpy(rng.uniform(-0.5, 0.8, (4000, 3)).astype(np.float32)) - origins
+    aim[::7] *= -1
+    aim[::5, 1] = 0  # along a wall of the box
+    directions = torch.nn.functional.normalize(aim, dim=-1)
+    # ray by ray, the places where the shape is asked for
+    o, d = origins.double(), directions.double()
+    inverse = 1 / torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
+    a, b = ((side - o) * inverse for side in grid.tight_aabb().double())
+    near, far = torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)
+    t = near[:, None] + (far - near)[:, None] * (torch.arange(40) + 0.5) / 40
+    expected = (far > near) & grid.contains(o[:, None] + d[:, None] * t[..., None]).any(1)
+    assert 0.1 < expected.float().mean() < 0.9
+    assert torch.equal(meets(grid, origins, directions), expected)
+
+
+@pytest.mark.parametrize("steps", [-1, 0, 1, 2, 5, 30])
+def test_voxels_grow(rng, steps):
+    for shape, share in product([(12, 17, 9), (1, 20, 5)], [0.0, 0.003, 0.2]):
+        voxels = rng.random(shape) < share
+        for within in (None, rng.random(shape) < 0.3, rng.random(shape) < 0.6):
+            cube = np.ones((3, 3, 3), bool)
+            expected = ndimage.binary_dilation(voxels, cube, iterations=max(steps, 0), mask=within) if steps else voxels
+            np.testing.assert_array_equal(grown(voxels, steps, within), expected)
