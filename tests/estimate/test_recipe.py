@@ -3,9 +3,12 @@
 import pytest
 import torch
 
+from refield.estimate.models import Models
 from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.scene.errors import InputError
+from refield.scene.images import frame_image, write_image
 from refield.scene.pose import angle_between, transform
+from refield.vision.segmenter import GrabCutSegmenter
 from tests.estimate.boxes import BoxWorld, capture_of, new_photos, standing, turn
 
 CRATE = standing((0.2, 0.17, 0.18), -0.25, -0.2, 20, paint=3)
@@ -88,3 +91,40 @@ def test_another_scene_is_refused(old, tmp_path):
     wall = standing((0.95, 0.95, 0.5), 0, 0, 0, paint=-1)
     with pytest.raises(InputError, match="% of the pixels changed; is this the same scene"):
         estimate(old, BoxWorld((wall,)), tmp_path)
+
+
+def test_an_object_that_an_earlier_visit_found_is_not_segmented_again(old, tmp_path):
+    """§11.3.2: only its old pictures are looked at, and the shape is the one that was known."""
+    true = turn(centre(CRATE), 50, (0.35, -0.15, 0))
+    photos = new_photos(BoxWorld((CRATE.moved(true), DRUM)), tmp_path)
+    first = estimate_change(old, BEFORE, photos, EstimateConfig(survey=6)).objects[0]
+    asked = []
+
+    class Asked(GrabCutSegmenter):
+        def masks(self, image, boxes, hint=None):
+            asked.append(boxes)
+            return super().masks(image, boxes, hint)
+
+    models = Models(segmenter=Asked())
+    (again,) = estimate_change(old, BEFORE, photos, EstimateConfig(survey=6), models=models, known=[first.grid]).objects
+    assert again.kind == "moved" and len(asked) <= len(photos)
+    assert float(angle_between(again.new_from_old, true)) < 0.7
+    inside = overlap(again.grid, CRATE)[1]
+    assert abs(inside - overlap(first.grid, CRATE)[1]) < 0.05
+    assert len(again.masks) == len(old.train)
+
+
+def test_what_nothing_rigid_explains_is_told_and_not_invented(old, tmp_path):
+    """Each photo shows another scribble before the same box: no solid thing looks like that."""
+    photos = new_photos(BEFORE, tmp_path)
+    rng = torch.Generator().manual_seed(3)
+    for frame in photos:
+        image = frame_image(frame).clone()
+        h, w = image.shape[:2]
+        image[h // 3 : 2 * h // 3, w // 3 : 2 * w // 3] = torch.randint(0, 255, (3,), generator=rng).byte()
+        write_image(frame.path, image)
+    change = estimate_change(old, BEFORE, photos, EstimateConfig(survey=6))
+    assert all(o.kind == "added" for o in change.objects)  # nothing that was there is said to have moved or left
+    if not change.objects:
+        assert "not understood" in change.why and len(change.unexplained) == 4
+        assert all(m.shape == (80, 80) and bool(m.any()) for m in change.unexplained)

@@ -190,7 +190,7 @@ def find_hits(origins: _F32, directions: _F32, values: _F32, box: _F64, tight: _
 
 @njit(parallel=True, **_JIT)
 def find_held(points: _F32, voxels: _Bool, low: _F32, cell: float, out: _Bool) -> None:
-    """``out`` (N,): whether a point lies in one of the voxels (X, Y, Z), of which the first has its centre at ``low``."""
+    """``out`` (N,): whether a point lies in one of the voxels (X, Y, Z); the first has its centre at ``low``."""
     nx, ny, nz = voxels.shape
     for n in prange(len(points)):
         i = (points[n, 0] - low[0]) / cell + 0.5

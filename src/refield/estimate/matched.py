@@ -44,14 +44,15 @@ class CutOut:
     scale: float
 
     @staticmethod
-    def of(picture: NDArray[np.uint8], mask: Mask, margin: int = 4) -> CutOut | None:
-        """None for an empty mask. ``margin``: pixels around it that the matcher sees too."""
+    def of(picture: NDArray[np.uint8], mask: Mask, margin: int = 4, least: int = _CROP) -> CutOut | None:
+        """None for an empty mask. ``margin``: pixels around it that the matcher sees too; ``least``: pixels to which
+        the part's longer side is enlarged."""
         box = pixels.bounding_box(mask, margin)
         if box is None:
             return None
         x0, y0, x1, y1 = box
         part = np.ascontiguousarray(picture[y0:y1, x0:x1])
-        scale = float(np.clip(_CROP / max(part.shape[:2]), 1, _ENLARGE))
+        scale = float(np.clip(least / max(part.shape[:2]), 1, _ENLARGE))
         if scale > 1:
             size = (round(part.shape[1] * scale), round(part.shape[0] * scale))
             part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_CUBIC), np.uint8)

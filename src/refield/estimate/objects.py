@@ -148,7 +148,7 @@ class Old:
         """
         outside, inside = (ndimage.distance_transform_edt(v) for v in (~self.voxels, self.voxels))
         depth = np.where(self.voxels, inside - 0.5, 0.5 - outside).astype(np.float32)
-        depth = ndimage.gaussian_filter(depth, 0.7) + _CARVED_AWAY
+        depth = ndimage.gaussian_filter(depth, 0.7) + (0 if self.remembered else _CARVED_AWAY)
         return self.lattice.grid(np.clip(0.5 + depth / 2, 0, 1))
 
     @cached_property

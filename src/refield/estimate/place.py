@@ -114,7 +114,8 @@ def _compared(view: View, pose: torch.Tensor, points: Array, stack: Array, targe
 
 def _cost(error: Array, config: PlaceConfig) -> float:
     q = (error**2).sum(-1) / config.robust**2
-    return float(np.nanmean(q / (1 + q)))
+    seen = np.isfinite(q)
+    return float((q[seen] / (1 + q[seen])).mean()) if seen.sum() > 0.5 * len(q) else np.inf
 
 
 def _descend(
@@ -150,6 +151,8 @@ def _step(view: View, error: Array, slopes: Array, local: Array, robust: float) 
     w = 1 / (1 + (e**2).sum(-1) / robust**2) ** 2
     a = np.einsum("ncp,n,ncq->pq", j, w, j)
     b = np.einsum("ncp,n,nc->p", j, w, e)
+    if not np.trace(a) > 0:  # a picture without any detail
+        return np.zeros(6)
     return -np.linalg.solve(a + 1e-6 * np.trace(a) * np.eye(6), b)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,6 +20,8 @@ from refield.estimate.look import Array, View
 from refield.estimate.models import ModelConfig, Models
 from refield.estimate.objects import Old
 from refield.estimate.outline import ObjectConfig, Seeds, outline, remembered
+from refield.estimate.paper.config import PaperConfig
+from refield.estimate.paper.route import estimate_change_paper
 from refield.estimate.place import PlaceConfig, place
 from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
@@ -54,6 +57,10 @@ class EstimateConfig:
     """refinement of poses through the field"""
     associate: AssociateConfig = field(default_factory=AssociateConfig)
     """what is believed"""
+    route: Literal["refield", "paper"] = "refield"
+    """the steps of this tool, or those of the paper as it gives them; the settings above are the former's"""
+    paper: PaperConfig = field(default_factory=PaperConfig)
+    """the paper's route"""
     models: ModelConfig = field(default_factory=ModelConfig)
     """what cuts things out and what finds corresponding points"""
 
@@ -99,6 +106,8 @@ def estimate_change(
         InputError: most of the pixels changed: the photos show another scene; or a model cannot be opened.
     """
     models = config.models.open() if models is None else models
+    if config.route == "paper":
+        return estimate_change_paper(capture, field, frames, models, config.paper, on_stage)
     say = on_stage or (lambda name: None)
     say("detect")
     scene = replace(_detected(capture, field, frames, config, models), known=tuple(known))
