@@ -76,7 +76,7 @@ def test_the_object_is_known_to_be_gone(stage):
 def test_registration_finds_the_turn(stage):
     centre = transform(TRUE, CRATE.world_from_box[:3, 3]).numpy() + np.array([0.04, -0.03, 0.03])
     wanted = tuple((p.open * 1.0 - ~p.changed.mask).astype(np.float32) for p in stage.past)
-    best = register(stage.old.cloud, stage.past, Target(centre.astype(np.float32), wanted), np.array([0, 0, 1.0]))
+    best = register(stage.old.cloud, stage.past, Target(centre[None].astype(np.float32), wanted), np.array([0, 0, 1.0]))
     degrees, distance = error(best[0].new_from_old)
     assert degrees < 1.0 and distance < 0.008
     assert best[0].score < 0.4 and all(a.score <= b.score for a, b in pairwise(best))

@@ -25,12 +25,15 @@ from refield.estimate.matched import matched_poses
 from refield.estimate.objects import Old
 from refield.estimate.outline import ObjectConfig, restricted
 from refield.estimate.past import Past, changed_share, gone_score, look_past
-from refield.estimate.pose_change import PoseChange, RefineConfig, refine
+from refield.estimate.pose_change import COARSEST, FINER, PoseChange, RefineConfig, refine
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
 from refield.field.radiance import Field
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 from refield.vision.matcher import Matcher
+
+_HOLDS_MORE = 3.0  # times an object's volume; the hull of one object, carved by few photos, is about twice as large
+_MOST_PLACES = 24  # that are tried in a component that holds several objects
 
 
 @dataclass(frozen=True)
@@ -140,25 +143,41 @@ def _place_all(
 ) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:
     """Place the old objects that fit somewhere, the best first, taking each off the photos."""
     moved: dict[int, PoseChange] = {}
-    guesses = {
-        k: matched_poses(old, views, ground.survey, ground.matcher)
-        for k, old in list(olds.items())[: ground.believe.most]
-    }
+    tried = list(olds.items())[: ground.believe.most]
+    guesses = {k: matched_poses(old, views, ground.survey, ground.matcher) for k, old in tried}
     everyone = list(olds.values())
     while True:
         parts = newcomers(ground, arrivals(ground, views, everyone), views)[: ground.believe.most]
-        targets = [t for p in parts for t in targets_of(views, ground.hull.lattice, p)]
         fits = {
-            k: best_fit(ground, olds[k], everyone, views, targets, extra)
+            k: best_fit(ground, olds[k], everyone, views, parts, extra)
             for k, extra in guesses.items()
-            if k not in moved and targets
+            if k not in moved and parts
         }
-        sure = [(score, k, change) for k, (score, change) in fits.items() if change is not None]
+        found = [(score, k, change) for k, (score, change) in fits.items() if change is not None]
+        sure = sorted(found, key=lambda f: f[0])
         if not sure:
             return moved, views, olds
-        _, k, change = min(sure, key=lambda s: s[0])
-        olds[k], moved[k] = trimmed(ground, olds[k], everyone, views, change)
-        views = take_off(ground.field, views, olds[k], moved[k])
+        for k, change in _together(sure, olds, ground.search.enough):
+            olds[k], moved[k] = trimmed(ground, olds[k], everyone, views, change)
+            views = take_off(ground.field, views, olds[k], moved[k])
+
+
+def _together(
+    sure: Sequence[tuple[float, int, PoseChange]], olds: dict[int, Old], enough: float
+) -> list[tuple[int, PoseChange]]:
+    """Of objects that fit, best first: the first, and those that fit as well as can be at places of their own.
+
+    The others are looked for again when these are off the photos.
+    """
+    taken: list[tuple[int, Tensor]] = []
+    out = []
+    for score, k, change in sure:
+        centre = transform(change.new_from_old, torch.from_numpy(olds[k].centre).double())
+        apart = [float((centre - c).norm()) > 0.8 * (olds[k].radius + olds[j].radius) for j, c in taken]
+        if not taken or (score <= enough and all(apart)):
+            taken.append((k, centre))
+            out.append((k, change))
+    return out
 
 
 def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> Voxels:
@@ -186,9 +205,9 @@ def newcomers(ground: Ground, voxels: Voxels, past: Sequence[Past]) -> list[Voxe
     for part in components(thick, ground.carving.smallest):
         shares = []
         shadows = [shadow_of(p.view, lattice, part) for p in past]
-        for here, gone in zip(shadows, taken):
+        for here, gone, p in zip(shadows, taken, past):
             if (here & ~gone).sum() >= ground.detect.smallest * here.size * 2:
-                shares.append(float((here & ~gone).sum() / here.sum()))
+                shares.append(float((here & ~gone).sum() / (here & p.known).sum()))
         enough = len(shares) >= min(2, len(past)) and float(np.median(shares)) > ground.believe.arrived
         if enough and not _only_light(ground, part, past):
             out.append(part)
@@ -240,18 +259,40 @@ def shadow_of(view: View, lattice: Lattice, voxels: Voxels) -> Mask:
     return pixels.close(out, 5)
 
 
-def targets_of(past: Sequence[Past], lattice: Lattice, voxels: Voxels) -> list[Target]:
-    """A component of the arrivals as places to register an object to: its middle, and where its bulk is thickest."""
-    wanted = []
+def targets_of(past: Sequence[Past], lattice: Lattice, voxels: Voxels, old: Old) -> list[Target]:
+    """A component of the arrivals as places to register an object to; those that come later are for when it fails.
+
+    Its middle, and where its bulk is thickest. One that is much larger than the object holds others too: then the
+    object may be wherever it fits in, and need not explain the whole.
+    """
+    wanted, never = [], []
     for p in past:
-        here = shadow_of(p.view, lattice, voxels)
-        never = ~pixels.dilate(p.changed.mask | p.changed.light | p.covered, 3)
-        wanted.append(np.where(p.open & here, 1.0, 0.0).astype(np.float32) - never.astype(np.float32))
-    middle = lattice.centres[voxels].mean(0)
+        here = p.open & shadow_of(p.view, lattice, voxels)
+        out = ~pixels.dilate(p.changed.mask | p.changed.light | p.covered, 3)
+        wanted.append(here.astype(np.float32) - out.astype(np.float32))
+        never.append(-out.astype(np.float32))
     inner = ndimage.distance_transform_edt(voxels)
+    if voxels.sum() * lattice.cell**3 > _HOLDS_MORE * old.volume:
+        places = _places_in(lattice, inner, old)
+        if len(places) > 1:
+            return [Target(places, tuple(never))]
+    middle = lattice.centres[voxels].mean(0)
     bulk = lattice.centres[inner > 0.7 * inner.max()].mean(0)
     centres = [middle] if np.linalg.norm(bulk - middle) < 4 * lattice.cell else [middle, bulk]
-    return [Target(c.astype(np.float32), tuple(wanted)) for c in centres]
+    return [Target(c[None].astype(np.float32), tuple(wanted)) for c in centres]
+
+
+def _places_in(lattice: Lattice, inner: Array, old: Old) -> Array:
+    """Spread places (K, 3) where an object's thickest part fits into a component; ``inner``: voxels to its surface."""
+    thickest = float(ndimage.distance_transform_edt(old.voxels).max()) * old.lattice.cell
+    fits = np.argwhere(inner * lattice.cell > min(0.8 * thickest, 0.7 * float(inner.max()) * lattice.cell))
+    at = lattice.centres[tuple(fits.T)]
+    chosen = [int(inner[tuple(fits.T)].argmax())]
+    nearest = np.linalg.norm(at - at[chosen[0]], axis=-1)
+    while len(chosen) < _MOST_PLACES and nearest.max() > 0.5 * old.radius:
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(at - at[chosen[-1]], axis=-1))
+    return at[chosen].astype(np.float32)
 
 
 def best_fit(
@@ -259,25 +300,32 @@ def best_fit(
     old: Old,
     olds: Sequence[Old],
     past: Sequence[Past],
-    targets: Sequence[Target],
+    parts: Sequence[Voxels],
     extra: Sequence[Tensor] = (),
 ) -> tuple[float, PoseChange | None]:
-    """The pose change that best explains the photos with one old object, and its registration score."""
+    """The pose change that best explains the photos with one old object, and its registration score.
+
+    ``parts``: the arrivals' components, any of which it may be, or be in.
+    """
     believe = ground.believe
     found: list[Candidate] = []
-    for target in targets:
-        found += register(old.cloud, past, target, ground.up, ground.search, extra)
+    for part in parts:
+        for target in targets_of(past, ground.hull.lattice, part, old):
+            here = register(old.cloud, past, target, ground.up, ground.search, extra)
+            found += here
+            if here[0].score <= ground.search.enough:
+                break
     found.sort(key=lambda c: c.score)
     best: PoseChange | None = None
     sight = Sight(ground.field, old, past, olds)
     for candidate in found[: believe.refined]:
         if candidate.score > min(believe.fits, found[0].score + 0.1):
             break
-        change = refine(sight, candidate.new_from_old, ground.fine, finest=1)
+        change = refine(sight, candidate.new_from_old, ground.fine, COARSEST)
         if change is not None and (best is None or change.explained > best.explained + 0.02):
             best = change
     if best is not None:
-        best = refine(sight, best.new_from_old, ground.fine)
+        best = refine(sight, best.new_from_old, ground.fine, FINER)
     if best is not None and (best.explained < believe.explains or best.explained < best.before + believe.gains):
         best = None
     return (found[0].score if found else 2.0), best

@@ -14,8 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.estimate.explain import explained
-from refield.estimate.layers import Crop, Layer, Layers, Sight, layers
+from refield.estimate.layers import Crop, Layer, Layers, Sight
+from refield.estimate.layers import layers as at_pose
 from refield.vision import pixels
+
+ALL, COARSEST, FINER = slice(None), slice(0, 1), slice(1, None)
+"""levels of the refinement"""
 
 _DARK = 0.02  # what is as dark as this says little about its light
 _BRIGHTER = 2.5  # times, at most, that the object may be at its new place
@@ -144,12 +148,14 @@ def _residuals(
     return e, weight, torch.stack(columns, -1)
 
 
-def refine(sight: Sight, start: Tensor, config: RefineConfig = RefineConfig(), finest: int = -1) -> PoseChange | None:
-    """Improve T from ``start``, up to the ``finest`` of the levels; None if no photo shows the place."""
+def refine(
+    sight: Sight, start: Tensor, config: RefineConfig = RefineConfig(), levels: slice = ALL
+) -> PoseChange | None:
+    """Improve T from ``start`` on some of the levels, coarse to fine; None if no photo shows the place."""
     unit = torch.tensor([1.0] * 3 + [1 / max(sight.old.radius, 1e-6)] * 3, dtype=torch.float64)
-    pose, levels = start, list(zip(config.rays, config.blurs, config.steps))
-    for rays, sigma, steps in levels[: len(levels) if finest < 0 else finest]:
-        ready = layers(sight, pose, rays)
+    pose = start
+    for rays, sigma, steps in list(zip(config.rays, config.blurs, config.steps))[levels]:
+        ready = at_pose(sight, pose, rays)
         if not ready.crops:
             return None
         pose, hessian = _descend(ready, pose, (sigma, steps), unit, config)

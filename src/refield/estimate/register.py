@@ -18,7 +18,7 @@ from refield.estimate.align_kernels import register_all
 from refield.estimate.look import Array, View
 from refield.estimate.objects import Cloud, sides_of
 from refield.estimate.past import Past
-from refield.scene.pose import angle_between, rigid
+from refield.scene.pose import angle_between, rigid, transform
 from refield.vision import pixels
 
 _F64 = NDArray[np.float64]
@@ -60,10 +60,10 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Target:
-    """Where to look for an object: a middle in the world and the pixels it should cover."""
+    """Where to look for an object: where its middle may be, and the pixels it should cover."""
 
-    centre: Array
-    """(3,)"""
+    centres: Array
+    """(K, 3) world"""
     wanted: tuple[Array, ...]
     """per view (H, W): 1 should be covered, 0 may be, -1 must not be"""
 
@@ -150,21 +150,24 @@ def register(
     """
     middle = cloud.points.mean(0)
     radius = float(np.sqrt(((cloud.points - middle) ** 2).sum(-1).mean()))
-    away = [max(float(np.linalg.norm(target.centre - p.view.centre)), 1e-6) for p in past]
+    middle_of_all = target.centres.mean(0)
+    away = [max(float(np.linalg.norm(middle_of_all - p.view.centre)), 1e-6) for p in past]
     size = [2 * radius * p.view.camera.fx / d for p, d in zip(past, away)]
     search = _Search(cloud, past, target, middle, radius, size, config)
-    likely = turns_about(up, config.turns)
-    centres = np.repeat(np.asarray(target.centre, np.float64)[None], len(likely), 0)
+    turns, places = turns_about(up, config.turns), np.asarray(target.centres, np.float64)
+    likely, centres = np.tile(turns, (len(places), 1, 1)), np.repeat(places, len(turns), 0)
     for guess in extra:
         likely = np.concatenate([likely, guess[:3, :3].numpy()[None]])
         centres = np.concatenate([centres, (guess[:3, :3].numpy() @ middle + guess[:3, 3].numpy())[None]])
     found = search.best(likely, centres)
     if found[0].score > config.enough:
         every = super_fibonacci(config.rotations)
-        found += search.best(every, np.repeat(centres[:1], len(every), 0))
-    order = _distinct(
-        np.stack([c.new_from_old[:3, :3].numpy() for c in found]), np.array([c.score for c in found]), 8, 3.0
-    )
+        best = transform(found[0].new_from_old, torch.from_numpy(middle).double()).numpy()
+        start = places[np.linalg.norm(places - best, axis=-1).argmin()]
+        found += search.best(every, np.repeat(start[None], len(every), 0))
+    poses = torch.stack([c.new_from_old for c in found])
+    at = transform(poses, torch.from_numpy(middle).double()).numpy()
+    order = search.distinct(poses[:, :3, :3].numpy(), at, np.array([c.score for c in found]), 8, 3.0)
     return [found[k] for k in order]
 
 
@@ -183,12 +186,24 @@ class _Search:
         c = self.config
         rotations, centres = rotations.copy(), centres.copy()
         scores = self.run(rotations, centres, c.points, c.steps, c.coarse_blur)
-        some = _distinct(rotations, scores, c.keep, 8.0)
+        some = self.distinct(rotations, centres, scores, c.keep, 8.0)
         rotations, centres = rotations[some].copy(), centres[some].copy()
         self.run(rotations, centres, 2 * c.points, 10, 0.5 * (c.coarse_blur + c.fine_blur))
         scores = self.run(rotations, centres, len(self.cloud.points), 12, c.fine_blur)
-        order = _distinct(rotations, scores, 8, 3.0)
+        order = self.distinct(rotations, centres, scores, 8, 3.0)
         return [Candidate(_pose(rotations[k], centres[k], self.middle), float(scores[k])) for k in order]
+
+    def distinct(self, rotations: _F64, centres: _F64, scores: _F64, count: int, apart: float) -> list[int]:
+        """Indices of the best scores whose poses differ by more than ``apart`` degrees, or in place."""
+        r = torch.from_numpy(rotations)
+        chosen: list[int] = []
+        for k in np.argsort(scores):
+            near = [c for c in chosen if np.linalg.norm(centres[k] - centres[c]) < 0.5 * self.radius]
+            if all(float(angle_between(r[k], r[c])) > apart for c in near):
+                chosen.append(int(k))
+            if len(chosen) == count:
+                break
+        return chosen
 
     def run(self, rotations: _F64, centres: _F64, count: int, steps: int, blur: float) -> _F64:
         """Improve the poses in place at one level of blur and score them."""
@@ -222,15 +237,3 @@ class _Search:
 def _pose(rotation: _F64, centre: _F64, middle: Array) -> Tensor:
     r = torch.from_numpy(np.ascontiguousarray(rotation))
     return rigid(r, torch.from_numpy(centre - rotation @ np.asarray(middle, np.float64)))
-
-
-def _distinct(rotations: _F64, scores: _F64, count: int, apart: float) -> list[int]:
-    """Indices of the best scores whose rotations differ by more than ``apart`` degrees."""
-    r = torch.from_numpy(rotations)
-    chosen: list[int] = []
-    for k in np.argsort(scores):
-        if all(float(angle_between(r[k], r[c])) > apart for c in chosen):
-            chosen.append(int(k))
-        if len(chosen) == count:
-            break
-    return chosen
