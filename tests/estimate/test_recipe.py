@@ -128,3 +128,18 @@ def test_what_nothing_rigid_explains_is_told_and_not_invented(old, tmp_path):
     if not change.objects:
         assert "not understood" in change.why and len(change.unexplained) == 4
         assert all(m.shape == (80, 80) and bool(m.any()) for m in change.unexplained)
+
+
+def test_two_boxes_that_changed_places_are_told_apart(old, tmp_path):
+    def to(a, b, degrees):
+        shift = centre(b) - centre(a)
+        return turn(centre(a), degrees, (float(shift[0]), float(shift[1]), 0))
+
+    there, back = to(CRATE, DRUM, 25), to(DRUM, CRATE, -40)
+    change = estimate(old, BoxWorld((CRATE.moved(there), DRUM.moved(back))), tmp_path)
+    assert [o.kind for o in change.objects] == ["moved", "moved"]
+    for box, true in ((CRATE, there), (DRUM, back)):
+        (found,) = (o for o in change.objects if bool(o.grid.contains(centre(box).float())))
+        assert float(angle_between(found.new_from_old, true)) < 1.5
+        assert float((transform(found.new_from_old, centre(box)) - transform(true, centre(box))).norm()) < 0.012
+    assert len({o.note for o in change.objects}) == 2 and all(0.5 < o.confidence <= 1 for o in change.objects)

@@ -15,6 +15,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from refield.estimate.alone import object_alone
+from refield.estimate.consist import consistent
 from refield.estimate.detect import Changed, DetectConfig, Mask
 from refield.estimate.hull import Hull, HullConfig, Plane, votes
 from refield.estimate.lattice import Lattice, Voxels, components, grown
@@ -122,6 +123,7 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
     still = torch.eye(4, dtype=torch.float64)
     places = [(olds[k], still) for k in kept] + [(olds[k], c.new_from_old) for k, c in moved.items()]
     arrived = [p for p in arrived if not any(_rim_of(ground, p, old, place) for old, place in places)]
+    arrived = [consistent(ground.hull.lattice, p, [(v.view, v.open) for v in views]) for p in arrived]
     moved = {k: c for k, c in moved.items() if _noticeable(olds[k], c, ground.believe.still)}
     return Settled(moved, removed, tuple(arrived), tuple(views), tuple(olds))
 
@@ -136,6 +138,14 @@ def unexplained(ground: Ground, settled: Settled, part: Voxels) -> bool:
         shown += int(here.sum())
         left += int((here & p.changed.mask & ~p.explained & ~pixels.dilate(came, 2)).sum())
     return left > ground.believe.touched * shown
+
+
+def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
+    """Whether an object's pixels changed and show what was behind it."""
+    if changed_share(changed, old) < ground.believe.touched:
+        return False
+    share, asked = gone_score(look_past(ground.field, changed, ground.survey, [old], ground.detect), old)
+    return share >= ground.believe.gone and asked >= 12
 
 
 def _place_all(
@@ -309,12 +319,10 @@ def best_fit(
     """
     believe = ground.believe
     found: list[Candidate] = []
-    for part in parts:
-        for target in targets_of(past, ground.hull.lattice, part, old):
-            here = register(old.cloud, past, target, ground.up, ground.search, extra)
-            found += here
-            if here[0].score <= ground.search.enough:
-                break
+    for target in (t for part in parts for t in targets_of(past, ground.hull.lattice, part, old)):
+        found += register(old.cloud, past, target, ground.up, ground.search, extra)
+        if min(c.score for c in found) <= ground.search.enough:
+            break
     found.sort(key=lambda c: c.score)
     best: PoseChange | None = None
     sight = Sight(ground.field, old, past, olds)

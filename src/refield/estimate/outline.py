@@ -24,6 +24,8 @@ from refield.scene.change import OccupancyGrid
 from refield.vision import pixels
 from refield.vision.segmenter import Segmenter, cut_out
 
+_FOUND = 0.25  # of an object's voxels that a segmenter must leave to be believed
+
 
 @dataclass(frozen=True)
 class ObjectConfig:
@@ -85,7 +87,9 @@ def outline(
     free = _free(lattice, planes)
     voxels, stands_free = _connected(lattice, solid & free, seeds, config)
     if voxels.any() and not stands_free:
-        voxels = _cut_out(lattice, voxels, patches, segmenter, config)
+        cut = _cut_out(lattice, voxels, patches, segmenter, config)
+        # where colours are much alike, a segmenter may find nothing of it
+        voxels = cut if cut.sum() > _FOUND * voxels.sum() else voxels
     if not voxels.any():
         return None
     voxels = ndimage.binary_fill_holes(voxels)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from refield.estimate import associate, detect, hull, light, look
-from refield.estimate.associate import AssociateConfig, Ground
+from refield.estimate.associate import AssociateConfig, Ground, Settled, looks_gone, unexplained
 from refield.estimate.conclude import Told, concluded
 from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.faces import changed_parts
@@ -128,11 +128,9 @@ def estimate_change(
         config.associate, config.register, config.refine, models.matcher,
     )  # fmt: skip
     settled = associate.settle(ground, olds, scene.changed)
-    # what goes on outside of the changed pixels was hidden by something, as a rule; else it is a thing after all
-    overlooked = [p for p in others if things and associate.unexplained(ground, settled, p)]
-    more = _were_there(scene, carved, overlooked, olds)
+    more = _overlooked(scene, ground, settled, (things, others), olds) if things else []
     if more:
-        settled = associate.settle(ground, [*olds, *more], scene.changed)
+        settled = associate.settle(ground, _whole([*olds, *more]), scene.changed)
     say("segment")
     return concluded(Told(field, capture.train, scene.changed, photos, carved), settled)
 
@@ -225,6 +223,33 @@ def _were_there(scene: _Scene, carved: Hull, parts: Sequence[Voxels], known: Seq
         if old is not None:
             found.append(old)
     return found
+
+
+def _whole(olds: list[Old]) -> list[Old]:
+    """Objects that are not mere pieces of others."""
+
+    def within(piece: Old, other: Old) -> bool:
+        return other.lattice.holds(grown(other.voxels, 1), piece.lattice.centres[piece.voxels]).mean() > 0.5
+
+    return [o for o in olds if not any(k.volume > o.volume and within(o, k) for k in olds)]
+
+
+def _overlooked(
+    scene: _Scene, ground: Ground, settled: Settled, parts: tuple[list[Voxels], list[Voxels]], known: list[Old]
+) -> list[Old]:
+    """Objects that look like what a newcomer hides, since they go on outside of the changed pixels, and yet left.
+
+    What they would explain is explained by nothing else, or the photos show what was behind them.
+    """
+    things, others = parts
+    least = 0.15 * max(float(p.sum()) for p in (*things, *others))
+    more: list[Old] = []
+    for part in others:
+        needed = unexplained(ground, settled, part)
+        if needed or part.sum() >= least:
+            found = _were_there(scene, ground.hull, [part], [*known, *more])
+            more += [old for old in found if needed or looks_gone(ground, scene.changed, old)]
+    return more
 
 
 def _up(capture: Capture) -> Array:

@@ -1,0 +1,81 @@
+"""A newcomer's shape, by the colours that photos agree on (space carving, Kutulakos and Seitz 2000).
+
+What a few silhouettes allow is about twice the object: a pyramid stands on its top, a skirt around its foot. A voxel of
+that excess is seen against something else by each photo, so their colours disagree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from refield.estimate.detect import Mask
+from refield.estimate.lattice import Lattice, Voxels, components
+from refield.estimate.look import Array, View
+from refield.vision import pixels
+
+_UNLIKE = 10.0  # Lab units between two photos' colours of a point
+_ROUNDS = 40
+_LONGEST = 40  # voxels along the longest side while carving
+_LEAST = 0.15  # of the voxels that must be left, else the colours say nothing
+
+
+def consistent(lattice: Lattice, voxels: Voxels, photos: Sequence[tuple[View, Mask]]) -> Voxels:
+    """The voxels left when those are taken away, from the outside in, whose colours the photos do not agree on.
+
+    Args:
+        photos: new views, and the pixels (H, W) of each that show something new.
+    """
+    labs = [pixels.to_lab(pixels.blur(v.photo, 0.7)) for v, _ in photos]
+    where = lattice.centres[voxels]
+    coarse = Lattice.over(where.min(0), where.max(0), _LONGEST, lattice.cell)
+    left = lattice.holds(voxels, coarse.centres)
+    begin = int(left.sum())
+    for _ in range(_ROUNDS):
+        at = np.argwhere(left)
+        seen = [_shown(v, m, coarse.centres[left], coarse.cell) for v, m in photos]
+        wrong = _disagree(seen, labs)
+        if not wrong.any():
+            break
+        left[tuple(at[wrong].T)] = False
+    parts = components(left, 8)
+    if not parts or parts[0].sum() < _LEAST * begin:
+        return voxels
+    return voxels & coarse.holds(parts[0], lattice.centres)
+
+
+def _shown(view: View, mask: Mask, points: Array, cell: float) -> tuple[Array, Array]:
+    """Pixel (N, 2) int of each point, and whether the photo shows it: nothing of the points stands before it."""
+    uv, distance, inside = view.project(points)
+    h, w = view.shape
+    at = np.clip(uv.astype(np.int64), 0, [w - 1, h - 1])
+    front = np.full((h, w), np.inf, np.float32)
+    np.minimum.at(front, (at[inside, 1], at[inside, 0]), distance[inside])
+    slack = 1.5 * (cell + view.pixel_angle * distance)
+    return at, inside & mask[at[:, 1], at[:, 0]] & (distance < front[at[:, 1], at[:, 0]] + slack)
+
+
+def _disagree(seen: Sequence[tuple[Array, Array]], labs: Sequence[Array]) -> Mask:
+    """Points (N,) of which two photos show colours that differ, also from what is a pixel aside."""
+    worst = np.zeros(len(seen[0][0]), np.float32)
+    for a in range(len(seen)):
+        for b in range(a):
+            both = np.flatnonzero(seen[a][1] & seen[b][1])
+            if len(both):
+                one = _nearest(labs[a], seen[a][0][both], labs[b], seen[b][0][both])
+                two = _nearest(labs[b], seen[b][0][both], labs[a], seen[a][0][both])
+                worst[both] = np.maximum(worst[both], np.minimum(one, two))
+    return worst > _UNLIKE
+
+
+def _nearest(lab: Array, at: Array, other: Array, there: Array) -> Array:
+    """Distance (K,) of a pixel's colour to the most similar one around a pixel of another photo."""
+    h, w = other.shape[:2]
+    colour = lab[at[:, 1], at[:, 0]]
+    best = np.full(len(at), np.inf, np.float32)
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            i, j = np.clip(there[:, 1] + dy, 0, h - 1), np.clip(there[:, 0] + dx, 0, w - 1)
+            best = np.minimum(best, np.linalg.norm(colour - other[i, j], axis=-1))
+    return best
