@@ -217,7 +217,7 @@ def test_what_moved_and_what_left_are_found(found, moved, stage):
     assert (cube.kind, drum.kind) == ("moved", "removed")
     degrees, metres = off(moved, cube.new_from_old)
     assert degrees < 0.5 and metres < 0.002
-    assert overlap(cube.grid, stage.before.items[1]) > 0.85
+    assert overlap(cube.grid, stage.before.items[1]) > 0.8  # masks of 80 pixels, and 33 nodes across the object
     assert overlap(drum.grid, stage.before.items[2]) > 0.85
     assert cube.grid.values.shape == (100, 100, 100)
     assert "1 moved by 0.8" in found.why and "turned by 40 degrees" in found.why and "1 removed" in found.why
