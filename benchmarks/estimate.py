@@ -76,6 +76,8 @@ class Bench:
 
     def __init__(self, work: Path, out: Path, size: int, cameras: int, seeds: int) -> None:
         self.work, self.out, self.size, self.cameras, self.seeds = work, out, size, cameras, seeds
+        self.worlds: Sequence[str] = (*PAPER, *HARD)
+        """of the section ``kinds``"""
 
     def scene(self, name: str, seed: int = 0, size: int | None = None) -> Scene:
         """Photographed and fitted by the defaults, unless that was done before."""
@@ -93,6 +95,10 @@ class Bench:
     def report(self, section: str, note: str, rows: list[Row]) -> None:
         """Print a table and keep it."""
         print(f"\n### {section}\n\n{note}\n\n{markdown(rows)}\n", flush=True)
+        self.keep(section, rows, note)
+
+    def keep(self, section: str, rows: list[Row], note: str = "not finished") -> None:
+        """Write what was found so far."""
         self.out.mkdir(parents=True, exist_ok=True)
         (self.out / f"{section}.json").write_text(json.dumps({"note": note, "rows": rows}, indent=1))
 
@@ -181,7 +187,7 @@ def kinds(bench: Bench) -> None:
     """Every world, as photographed and as a phone would have it: what was found, and what was not there."""
     rows: list[Row] = []
     right = asked = alarms = 0
-    for name in (*PAPER, *HARD):
+    for name in bench.worlds:
         scene = bench.scene(name, size=128)
         for how, frames in (("as given", scene.new), ("disturbed", scene.disturbed(USUAL))):
             result, info = estimated(scene, frames)
@@ -198,6 +204,7 @@ def kinds(bench: Bench) -> None:
                     "_why": info["_why"],
                 }
             )
+        bench.keep("kinds", rows)  # it takes long
     for name in REFUSED:
         scene = bench.scene(name, size=128)
         result, info = estimated(scene, scene.new)
@@ -243,9 +250,11 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256, help="pixels a side, for poses and views")
     parser.add_argument("--cameras", type=int, default=70, help="old photos")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--worlds", nargs="+", choices=[*PAPER, *HARD], help="for kinds, in place of all")
     options = parser.parse_args()
     print(f"{date.today()}, {platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}")
     bench = Bench(options.work, options.out, options.size, options.cameras, options.seeds)
+    bench.worlds = options.worlds or bench.worlds
     for name in options.only:
         SECTIONS[name](bench)
 

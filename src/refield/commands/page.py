@@ -64,6 +64,7 @@ def _photos(change: SceneChange, old: Field, new: Field | None) -> tuple[Compari
                 after=None if new is None else render_frame(new, frame).rgb,
                 mask_in=change.masks_in[used] if change.masks_in else None,
                 mask_out=change.masks_out[used] if change.masks_out else None,
+                unclear=change.unexplained[used] if change.unexplained else None,
             )
         )
         used += 1

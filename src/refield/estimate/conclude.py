@@ -28,6 +28,7 @@ from refield.vision import pixels
 
 _NOTABLE = 0.002  # of a photo's pixels; smaller spots that nothing explains are not spoken of
 _MUCH = 0.25  # of the changed pixels; less that nothing explains is the ragged edge of what something does
+_LARGE = 0.02  # of a photo's pixels
 _MASK_RAYS = 300_000  # for the outlines of one object in all new photos; larger photos' masks are scaled up
 
 
@@ -66,6 +67,16 @@ def concluded(scene: Told, settled: Settled) -> SceneChange:
     ins, outs = _pixel_masks(scene.field, scene.changed, settled, lattice) if changes else ((), ())
     unexplained = tuple(_full_size(m, c) for m, c in zip(left, scene.changed))
     return SceneChange(tuple(changes), scene.photos, "; ".join(reasons), ins, outs, unexplained)
+
+
+def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...]) -> SceneChange:
+    """The answer where the photos' changes meet nowhere in space; told if they are more than the odd spot."""
+    why = "the pixels that differ agree on no place that more than one photo shows"
+    if max(float(c.mask.mean()) for c in changed) < _LARGE:
+        return SceneChange((), photos, why)
+    share = 100 * float(np.mean([c.mask.mean() for c in changed]))
+    why += f"; {share:.0f} % of the photos' pixels are not understood: do the photos show one and the same state?"
+    return SceneChange((), photos, why, unexplained=tuple(_full_size(c.mask, c) for c in changed))
 
 
 def _moved(frames: Sequence[Frame], old: Old, change: PoseChange) -> ObjectChange:

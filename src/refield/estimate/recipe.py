@@ -11,7 +11,7 @@ import torch
 
 from refield.estimate import associate, detect, hull, light, look
 from refield.estimate.associate import AssociateConfig, Ground, Settled, looks_gone, unexplained
-from refield.estimate.conclude import Told, concluded
+from refield.estimate.conclude import Told, concluded, disagreeing
 from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.faces import changed_parts
 from refield.estimate.hull import Hull, HullConfig, Plane
@@ -117,7 +117,7 @@ def estimate_change(
     say("hull")
     region = hull.find_region(scene.changed, config.hull)
     if region is None:
-        return SceneChange((), photos, "the pixels that differ agree on no place that more than one photo shows")
+        return disagreeing(scene.changed, photos)
     carved, free = _carved(scene, region)
     things, others = changed_parts(scene.changed, carved, free, config.hull.smallest, models.segmenter)
     olds = _were_there(scene, carved, things or others)

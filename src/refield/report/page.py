@@ -18,7 +18,10 @@ _SCRIPT = (
     "document.querySelectorAll('.slide input').forEach(i=>"
     "i.addEventListener('input',()=>i.parentElement.style.setProperty('--at',i.value+'%')))"
 )
-_KEY = '<p class="lead"><span class="key in"></span>there now &nbsp; <span class="key out"></span>no longer there</p>'
+_KEY = (
+    '<p class="lead"><span class="key in"></span>there now &nbsp; <span class="key out"></span>no longer there'
+    ' &nbsp; <span class="key unclear"></span>not understood</p>'
+)
 
 
 def html_page(report: VisitReport) -> str:
@@ -90,14 +93,14 @@ def _photos(report: VisitReport) -> str:
 
 def _views(views: Sequence[Comparison], photo_name: str) -> str:
     cards = "".join(_card(view, photo_name) for view in views)
-    masked = any(v.mask_in is not None or v.mask_out is not None for v in views)
+    masked = any(v.marked for v in views)
     return (_KEY if masked and cards else "") + cards
 
 
 def _card(view: Comparison, photo_name: str) -> str:
     pictures = [("before", view.before), (photo_name, view.photo), ("updated", view.after)]
-    if view.photo is not None and (view.mask_in is not None or view.mask_out is not None):
-        pictures.append(("changed pixels", with_masks(view.photo, view.mask_in, view.mask_out)))
+    if view.photo is not None and view.marked:
+        pictures.append(("changed pixels", with_masks(view.photo, view.mask_in, view.mask_out, view.unclear)))
     figures = "".join(
         f'<figure><img alt="{escape(f"{view.name}: {name}")}" src="{data_uri(picture)}">'
         f"<figcaption>{escape(name)}</figcaption></figure>"

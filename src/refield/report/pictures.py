@@ -15,9 +15,10 @@ from torch.nn import functional
 from refield.report.visit import Comparison
 from refield.scene.files import write_bytes
 
-IN_COLOUR, OUT_COLOUR = (
+IN_COLOUR, OUT_COLOUR, UNCLEAR_COLOUR = (
     (16, 185, 199),
     (249, 115, 22),
+    (147, 51, 234),
 )  # told apart by colour-blind eyes too, unlike green and red
 WIDEST = 960  # pixels of a picture on the page
 _PNG_PIXELS = 256 * 256  # larger pictures are inlined as JPEG
@@ -35,12 +36,13 @@ def data_uri(image: Tensor) -> str:
     return f"data:image/{kind.lower()};base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
-def with_masks(photo: Tensor, mask_in: Tensor | None, mask_out: Tensor | None) -> Tensor:
-    """The photo in pale grey with what is new and what is gone in colour and outlined; (H, W, 3) float."""
+def with_masks(photo: Tensor, mask_in: Tensor | None, mask_out: Tensor | None, unclear: Tensor | None = None) -> Tensor:
+    """The photo in pale grey with what is new, gone and not understood in colour and outlined; (H, W, 3) float."""
     image = _unit(photo)
     grey = (image @ torch.tensor([0.299, 0.587, 0.114]))[..., None]
     out = (0.75 * grey + 0.25).expand(*image.shape).clone()
-    inked = [(m, torch.tensor(c) / 255) for m, c in ((mask_in, IN_COLOUR), (mask_out, OUT_COLOUR)) if m is not None]
+    masks = (unclear, UNCLEAR_COLOUR), (mask_in, IN_COLOUR), (mask_out, OUT_COLOUR)
+    inked = [(m, torch.tensor(c) / 255) for m, c in masks if m is not None]
     for mask, ink in inked:
         out[mask] = 0.5 * image[mask] + 0.5 * ink
     for mask, ink in inked:

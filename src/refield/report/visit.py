@@ -43,6 +43,13 @@ class Comparison:
     """(H, W) bool: changed pixels that show what is there now"""
     mask_out: Tensor | None = None
     """(H, W) bool: changed pixels where something used to be"""
+    unclear: Tensor | None = None
+    """(H, W) bool: changed pixels that are not understood"""
+
+    @property
+    def marked(self) -> bool:
+        """Whether any mask is known."""
+        return any(m is not None for m in (self.mask_in, self.mask_out, self.unclear))
 
 
 @dataclass(frozen=True)
