@@ -173,6 +173,7 @@ def views(bench: Bench) -> None:
                     "_why": info["_why"],
                 }
             )
+        bench.keep("views", rows)  # each world takes a while
     bench.report("views", f"{bench.size}² pixels, one seed; the views are evenly spread on one circle", rows)
 
 

@@ -88,8 +88,10 @@ def outline(
     voxels, stands_free = _connected(lattice, solid & free, seeds, config)
     if voxels.any() and not stands_free:
         cut = _cut_out(lattice, voxels, patches, segmenter, config)
-        # where colours are much alike, a segmenter may find nothing of it
-        voxels = cut if cut.sum() > _FOUND * voxels.sum() else voxels
+        if cut.sum() < _FOUND * voxels.sum():  # where colours are much alike, a segmenter may find nothing of it
+            sure = components(voxels & seeds.lattice.holds(grown(seeds.changed, 1), lattice.centres), 30)
+            cut = sure[0] if sure else cut
+        voxels = cut
     if not voxels.any():
         return None
     voxels = ndimage.binary_fill_holes(voxels)

@@ -31,6 +31,7 @@ from refield.scene.change import OccupancyGrid, PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
 
 OnStage = Callable[[str], None]
+_OTHER_LIGHT = 2.0  # times brighter or darker, from which on a photo's light is spoken of
 
 
 @dataclass(frozen=True)
@@ -113,11 +114,13 @@ def estimate_change(
     scene = replace(_detected(capture, field, frames, config, models), known=tuple(known))
     photos = scene.photos
     if not any(c.mask.any() for c in scene.changed):
-        return SceneChange((), photos, "no pixel differs by more than the field's own errors on the old photos")
+        why = "no pixel differs by more than the field's own errors on the old photos"
+        return SceneChange((), photos, why + _light(photos))
     say("hull")
     region = hull.find_region(scene.changed, config.hull)
     if region is None:
-        return disagreeing(scene.changed, photos)
+        answer = disagreeing(scene.changed, photos)
+        return replace(answer, why=answer.why + _light(photos))
     carved, free = _carved(scene, region)
     things, others = changed_parts(scene.changed, carved, free, config.hull.smallest, models.segmenter)
     olds = _were_there(scene, carved, things or others)
@@ -143,7 +146,7 @@ def _detected(
     noise = detect.survey_noise(survey, config.detect)
     changed = detect.changes(views, noise, config.detect)
     shares = [float(c.mask.mean()) for c in changed]
-    photos = tuple(_verdict(v.frame, share, config.most_changed) for v, share in zip(views, shares))
+    photos = tuple(_verdict(c.view, share, config.most_changed) for c, share in zip(changed, shares))
     if all(p.status == "rejected" for p in photos):
         what = f"{100 * float(np.mean(shares)):.0f} % of the pixels changed; is this the same scene, in the same light?"
         raise InputError("new photos", what, "give photos of the scene that was trained, with poses in its world")
@@ -164,10 +167,21 @@ def _placed(field: Field, frame: Frame, config: EstimateConfig) -> View:
     return look.view_of(field, replace(frame, world_from_cam=placed.world_from_cam), config.max_pixels)
 
 
-def _verdict(frame: Frame, share: float, most: float) -> PlacedPhoto:
-    if share <= most:
-        return PlacedPhoto(frame.name, "used", frame=frame)
-    return PlacedPhoto(frame.name, "rejected", f"{100 * share:.0f} % of its pixels changed; it shows another scene")
+def _verdict(view: View, share: float, most: float) -> PlacedPhoto:
+    frame = view.frame
+    if share > most:
+        return PlacedPhoto(frame.name, "rejected", f"{100 * share:.0f} % of its pixels changed; it shows another scene")
+    gain = float(view.colour_fit[0].mean())
+    why = ""
+    if not 1 / _OTHER_LIGHT < gain < _OTHER_LIGHT:
+        why = f"{max(gain, 1 / gain):.1f} times {'darker' if gain > 1 else 'brighter'} than the field"
+    return PlacedPhoto(frame.name, "used", why, frame)
+
+
+def _light(photos: Sequence[PlacedPhoto]) -> str:
+    """What is to be said of light that changed in whole photos."""
+    other = [f"{p.name} is {p.why}" for p in photos if p.status == "used" and p.why]
+    return f"; the light changed: {', '.join(other)}" if other else ""
 
 
 def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
