@@ -148,8 +148,9 @@ def _detected(
     shares = [float(c.mask.mean()) for c in changed]
     photos = tuple(_verdict(c.view, share, config.most_changed) for c, share in zip(changed, shares))
     if all(p.status == "rejected" for p in photos):
-        what = f"{100 * float(np.mean(shares)):.0f} % of the pixels changed; is this the same scene, in the same light?"
-        raise InputError("new photos", what, "give photos of the scene that was trained, with poses in its world")
+        what = f"{100 * float(np.mean(shares)):.0f} % of the pixels changed; is this the same scene?"
+        give = "give photos of the scene that was trained, in its light, with poses in its world"
+        raise InputError("new photos", what, give)
     if any(p.status == "rejected" for p in photos):
         used = [v for v, p in zip(views, photos) if p.status == "used"]
         changed = detect.changes(used, noise, config.detect)
