@@ -18,6 +18,7 @@ from refield.field.render import render_camera, render_many
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change import OccupancyGrid
 from refield.scene.images import frame_image, write_image
+from refield.update.composite import UpdatedField
 from refield.update.store import load_updated
 from refield.workspace import Workspace
 
@@ -43,15 +44,16 @@ def state(workspace: Workspace, visit: int) -> Field:
     return field
 
 
-def known_objects(workspace: Workspace, visit: int) -> list[OccupancyGrid]:
-    """What earlier visits found out about things that can move, where each stands after ``visit``."""
-    known: list[OccupancyGrid] = []
-    for number in changed_visits(workspace, visit):
-        for o in workspace.change(number).objects:
-            centre = o.grid.tight_aabb().mean(0)
-            known = [k for k in known if not bool(k.contains(centre))]
-            if o.grid_now is not None:
-                known.append(o.grid_now)
+def known_objects(now: Field) -> list[OccupancyGrid]:
+    """What the visits that led to a field found out about things that can move, and where each stands in it."""
+    if not isinstance(now, UpdatedField):
+        return []
+    known = known_objects(now.pretrained)
+    for o in now.change.objects:
+        centre = o.grid.tight_aabb().mean(0)
+        known = [k for k in known if not bool(k.contains(centre))]
+        if o.grid_now is not None:
+            known.append(o.grid_now)
     return known
 
 

@@ -10,7 +10,7 @@ import torch
 from refield.estimate import recipe
 from refield.estimate.alone import object_alone
 from refield.estimate.faces import changed_parts
-from refield.estimate.layers import Sight, layers
+from refield.estimate.layers import Sight, layers_at
 from refield.estimate.matched import camera_from_object, matched_poses
 from refield.estimate.models import Models
 from refield.estimate.past import changed_share, gone_score, look_past
@@ -111,7 +111,7 @@ def test_refinement_through_the_field_improves_a_rough_pose(stage):
 
 def test_colour_slopes_with_respect_to_the_pose_are_those_of_finite_differences(stage):
     """The sliding-layer derivative: same direction and size for every one of six motions."""
-    r, config = layers(Sight(BEFORE, stage.old, stage.past, [stage.old]), TRUE, 12_000), RefineConfig(shaded=0.0)
+    r, config = layers_at(Sight(BEFORE, stage.old, stage.past, [stage.old]), TRUE, 12_000), RefineConfig(shaded=0.0)
     now = residuals(r, TRUE, 1.5, config)
     inner = now.weight > 0.5
     for k in range(6):

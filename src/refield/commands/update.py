@@ -81,8 +81,7 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         number = workspace.visits
         old = state(workspace, number)
         capture = _capture_now(workspace, number, old, clock, Path(scratch))
-        known = known_objects(workspace, number)
-        change = estimate_change(capture, old, frames, options.estimate, on_stage=clock.stage, known=known)
+        change = estimate_change(capture, old, frames, options.estimate, on_stage=clock.stage, known=known_objects(old))
         _need_a_photo(options.photos, change)
         new = _updated(capture, old, change, options.update, clock)
         clock.stage("report")

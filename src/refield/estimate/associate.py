@@ -107,12 +107,8 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
     views = look_past(ground.field, changed, ground.survey, [olds[k] for k in touched], ground.detect)
     moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, views)
     olds = [placed.get(k, old) for k, old in enumerate(olds)]
-    removed = {}
-    for k in touched:
-        if k not in moved:
-            share, asked = gone_score(views, olds[k])
-            if share >= ground.believe.gone and asked >= 12:
-                removed[k] = share
+    shares = {k: _gone(ground, views, olds[k]) for k in touched if k not in moved}
+    removed = {k: share for k, share in shares.items() if share is not None}
     kept = [k for k in touched if k in moved or k in removed]
     if len(kept) < len(touched):  # what never left hides what is behind it after all
         views = look_past(ground.field, changed, ground.survey, [olds[k] for k in kept], ground.detect)
@@ -144,8 +140,14 @@ def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
     """Whether an object's pixels changed and show what was behind it."""
     if changed_share(changed, old) < ground.believe.touched:
         return False
-    share, asked = gone_score(look_past(ground.field, changed, ground.survey, [old], ground.detect), old)
-    return share >= ground.believe.gone and asked >= 12
+    views = look_past(ground.field, changed, ground.survey, [old], ground.detect)
+    return _gone(ground, views, old) is not None
+
+
+def _gone(ground: Ground, views: Sequence[Past], old: Old) -> float | None:
+    """Part of an object's pixels that show what was behind it; None if they are too few to say that it left."""
+    share, asked = gone_score(views, old)
+    return share if share >= ground.believe.gone and asked >= 12 else None
 
 
 def _place_all(

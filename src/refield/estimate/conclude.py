@@ -16,7 +16,7 @@ from refield.estimate.associate import Settled, shadow_of
 from refield.estimate.detect import Changed, Mask
 from refield.estimate.hull import Hull
 from refield.estimate.lattice import Lattice, Voxels
-from refield.estimate.layers import Sight, layers
+from refield.estimate.layers import Sight, layers_at
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.pose_change import PoseChange
@@ -119,7 +119,7 @@ def _fresh(settled: Settled, lattice: Lattice, part: Voxels) -> float:
 def _unexplained(scene: Told, settled: Settled) -> list[Mask]:
     """Per photo, the changed pixels that nothing accounts for; nothing at all if they are few."""
     out = []
-    for c, p in zip(scene.changed, settled.views or ()):
+    for c, p in zip(scene.changed, settled.views):
         told = pixels.dilate(p.covered, 3) | p.explained | ~p.known
         for k in (*settled.moved, *settled.removed):
             told |= pixels.dilate(past.silhouette(c.view, settled.olds[k]), 3)
@@ -172,7 +172,7 @@ def _pixel_masks(
 
 def _shown_in(sight: Sight, new_from_old: Tensor) -> dict[int, Tensor]:
     """The moved object's outline in each photo that shows it, by the photo's index, (H, W) bool."""
-    ready = layers(sight, new_from_old, _MASK_RAYS)
+    ready = layers_at(sight, new_from_old, _MASK_RAYS)
     out = {}
     for crop, shown in zip(ready.crops, ready.show(new_from_old)):
         x0, y0, x1, y1 = crop.box

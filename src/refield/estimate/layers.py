@@ -18,7 +18,7 @@ from torch import Tensor
 
 from refield.estimate.alone import object_alone, sampler_around
 from refield.estimate.explain import Compared
-from refield.estimate.look import Hidden, load_photo, see
+from refield.estimate.look import Hidden, load_photo, pixel_slopes, see
 from refield.estimate.objects import Old, box_in, patch_rays
 from refield.estimate.past import Past
 from refield.field.radiance import Field
@@ -159,7 +159,8 @@ class Layers:
         depth = torch.from_numpy(seen[nearest[0], nearest[1]].reshape(-1)).double()
         depth = torch.where(torch.isfinite(depth), depth, torch.ones_like(depth))
         x = crop.rays.origins.double() + crop.rays.directions.double() * depth[:, None]
-        per_point = _pixel_slopes(crop, x)
+        m = crop.world_from_cam
+        per_point = pixel_slopes(crop.camera, (x - m[:3, 3]) @ m[:3, :3]) @ m[:3, :3].T
         per_twist = torch.cat([per_point, per_point @ -skew(x - transform(new_from_old, self.centre))], -1)
         dv, du = np.gradient(np.concatenate([layer, alpha[..., None]], -1), axis=(0, 1))
         slope = torch.from_numpy(np.stack([du, dv], -1).reshape(h * w, 4, 2)).double()
@@ -173,7 +174,7 @@ class Layers:
         return shift @ exp(twist) @ invert(shift) @ new_from_old
 
 
-def layers(sight: Sight, start: Tensor, rays: int) -> Layers:
+def layers_at(sight: Sight, start: Tensor, rays: int) -> Layers:
     """The photos around the place where ``start`` (4, 4) puts the object, scaled down to ``rays`` in all."""
     corners = transform(start, torch.cartesian_prod(*sight.old.grid.tight_aabb().T.double())).numpy()
     boxes = [(p, box_in(p.view.frame.camera, p.view.frame, corners, _MARGIN)) for p in sight.past]
@@ -210,14 +211,3 @@ def _crop(index: int, p: Past, camera: Camera, box: tuple[int, int, int, int]) -
         torch.from_numpy(p.known[pick].reshape(-1)),
         torch.from_numpy(p.changed.threshold[pick].reshape(-1)),
     )
-
-
-def _pixel_slopes(crop: Crop, x: Tensor) -> Tensor:
-    """d(u, v) / d(world point), (n, 2, 3), the lens' distortion left out."""
-    m = crop.world_from_cam
-    p = (x - m[:3, 3]) @ m[:3, :3]
-    z = p[:, 2].clamp_min(1e-6)
-    zero = torch.zeros_like(z)
-    u = torch.stack([crop.camera.fx / z, zero, -crop.camera.fx * p[:, 0] / z**2], -1)
-    v = torch.stack([zero, crop.camera.fy / z, -crop.camera.fy * p[:, 1] / z**2], -1)
-    return torch.stack([u, v], 1) @ m[:3, :3].T

@@ -137,6 +137,15 @@ def median_depth(sigmas: Tensor, samples: Samples) -> Tensor:
     return torch.where(found, samples.t_starts[index] + part * delta[index], out)
 
 
+def pixel_slopes(camera: Camera, local: Tensor) -> Tensor:
+    """d(u, v) / d(point) of points (N, 3) in the camera's frame, (N, 2, 3), the lens' distortion left out."""
+    z = local[:, 2].clamp_min(1e-6)
+    zero = torch.zeros_like(z)
+    u = torch.stack([camera.fx / z, zero, -camera.fx * local[:, 0] / z**2], -1)
+    v = torch.stack([zero, camera.fy / z, -camera.fy * local[:, 1] / z**2], -1)
+    return torch.stack([u, v], 1)
+
+
 @dataclass(frozen=True)
 class View:
     """One posed photo beside the old field's rendering of it, at working resolution."""

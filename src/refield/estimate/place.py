@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from refield.estimate.look import Array, View
+from refield.estimate.look import Array, View, pixel_slopes
 from refield.scene.pose import exp
 from refield.vision import pixels
 
@@ -137,13 +137,7 @@ def _step(view: View, error: Array, slopes: Array, local: Array, robust: float) 
     """Twist (6,) of the camera, in its own frame, that multiplies its pose from the right."""
     ok = np.isfinite(error).all(-1)
     e, x = error[ok], local[ok]
-    z = np.maximum(x[:, 2], 1e-6)
-    fx, fy = view.camera.fx, view.camera.fy
-    zero = np.zeros_like(z)
-    duv = np.stack(
-        [np.stack([fx / z, zero, -fx * x[:, 0] / z**2], -1), np.stack([zero, fy / z, -fy * x[:, 1] / z**2], -1)], 1
-    )
-    per_point = slopes[ok] @ duv  # (N, 3, 3)
+    per_point = slopes[ok] @ pixel_slopes(view.camera, torch.from_numpy(x)).numpy()  # (N, 3, 3)
     # a camera that moves by (v, w) sees a point at x - v - w × x
     cross = np.cross(x[:, None, :], np.eye(3)[None])  # rows: x × e_k = -(e_k × x)
     per_turn = np.einsum("nij,nkj->nik", per_point, cross)

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.estimate.explain import explained
-from refield.estimate.layers import Crop, Layer, Layers, Sight
-from refield.estimate.layers import layers as at_pose
+from refield.estimate.layers import Crop, Layer, Layers, Sight, layers_at
 from refield.vision import pixels
 
 ALL, COARSEST, FINER = slice(None), slice(0, 1), slice(1, None)
@@ -155,7 +154,7 @@ def refine(
     unit = torch.tensor([1.0] * 3 + [1 / max(sight.old.radius, 1e-6)] * 3, dtype=torch.float64)
     pose = start
     for rays, sigma, steps in list(zip(config.rays, config.blurs, config.steps))[levels]:
-        ready = at_pose(sight, pose, rays)
+        ready = layers_at(sight, pose, rays)
         if not ready.crops:
             return None
         pose, hessian = _descend(ready, pose, (sigma, steps), unit, config)
