@@ -20,6 +20,9 @@ _PROBED_AT_FIRST, _PROBED = 16, 64  # one in so many cells, each time
 # Core radii; from the core to here cameras stand (see `place_contraction`). What is there must show itself: with the
 # benefit of the doubt a photo's background is learnt as haze before the cameras opposite, and new views meet it
 _CAMERAS = 2.0
+# A sample's opacity; once surfaces have become sharp, what is thinner than this where cameras stand is haze: for the
+# cameras opposite it is a part of their background, for a new camera it lies before everything
+_HAZE = 0.3
 _BACKGROUND = 5.0  # core radii; a cell that no ray ever crossed is taken for empty, unless it is further out
 
 
@@ -41,13 +44,16 @@ class OccupancyTrainer:
         self.allowed = torch.ones(cells, dtype=torch.bool, device=device) if allowed is None else allowed
         self.rounds = 1  # renewals of the grid, from 1
         self.open = self.allowed.nonzero()[:, 0]
+        self.sharp = False
+        self.among_cameras = torch.zeros(cells, dtype=torch.bool, device=device)
         self.state = large_zeros(cells, 4).to(device)
         """see `kernels.reference.observe`"""
         self.state[:, 1] = 16 * _WEIGHT  # the benefit of the doubt
         for some in torch.arange(cells, device=device).split(1 << 20):
             self.state[some, 2] = model.sampler.step_at(some)
             distance = model.sampler.distance(some)
-            self.state[some, 0] = torch.where((distance > 1) & (distance < _CAMERAS), 0.0, doubt)
+            self.among_cameras[some] = (distance > 1) & (distance < _CAMERAS)
+            self.state[some, 0] = torch.where(self.among_cameras[some], 0.0, doubt)
             self.state[some, 3] = torch.where(distance > _BACKGROUND, 0.0, -1.0)
 
     @property
@@ -74,7 +80,8 @@ class OccupancyTrainer:
             # a few hidden cells get another chance, since geometry still changes
             again = self.open[torch.randint(len(self.open), (len(self.open) // 100,), device=self.open.device)]
             self.state[again, 1] = self.state[again, 1].clamp_min(4 * _WEIGHT)
-        self._set(_WEIGHT if step >= self.cull_from else -1.0, step >= 4 * self.cull_from)
+        self.sharp = step >= 4 * self.cull_from
+        self._set(_WEIGHT if step >= self.cull_from else -1.0, self.sharp)
         self.rounds += 1
 
     def _probe(self, cells: Tensor) -> Tensor:
@@ -89,7 +96,10 @@ class OccupancyTrainer:
     def _set(self, weight: float, only_seen: bool) -> None:
         """Show cells that are opaque enough and have a weight above ``weight``."""
         opacity = min(_OPACITY, float(self.state[:, 0].mean()))
-        grid = kernels.keep(self.state, self.allowed, opacity, weight, only_seen)
+        allowed = self.allowed
+        if self.sharp:
+            allowed = allowed & ~(self.among_cameras & (self.state[:, 0] < _HAZE))
+        grid = kernels.keep(self.state, allowed, opacity, weight, only_seen)
         self.model.looking_where(grid.reshape(self.model.sampler.grid.shape))
 
     def settle(self, pixels: PixelBank, rays: int = 200_000) -> None:
