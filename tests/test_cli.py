@@ -145,6 +145,32 @@ def test_updates_stack(place, monkeypatch, capsys):
     assert main(["evaluate", "work", "new", "--visit", "1"]) == 0
 
 
+def test_visits_are_listed_and_taken_back(place, monkeypatch, capsys):
+    monkeypatch.setattr(update, "MOST_LOST", 100.0)
+    assert main(["visits", "work"]) == 0
+    assert "no visit" in capsys.readouterr().out
+    assert main(["undo", "work"]) == 2
+    assert "nothing to take back" in capsys.readouterr().err
+    before = contents(place / "work")
+    believing(monkeypatch, "moved", "added")
+    assert main(["update", "work", "new", *FEW]) == 0
+    first = contents(place / "work")
+    believing(monkeypatch)
+    assert main(["update", "work", "new"]) == 0
+    capsys.readouterr()
+    assert main(["visits", "work", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["visits"]
+    assert [v["visit"] for v in told] == [1, 2] and [v["changed"] for v in told] == [True, False]
+    assert [o["kind"] for o in told[0]["objects"]] == ["moved", "added"] and told[1]["objects"] == []
+    assert told[0]["objects"][0]["moved_by"] == pytest.approx(0.5) and told[0]["photos_rejected"] == 1
+    assert main(["visits", "work"]) == 0
+    out = capsys.readouterr().out
+    assert "moved from (0, 0, 0) by 0.5" in out and "added at" in out and "because" in out
+    assert main(["undo", "work"]) == 0 and contents(place / "work") == first
+    assert main(["undo", "work"]) == 0 and contents(place / "work") == before
+    assert "after visit 0" in capsys.readouterr().out
+
+
 def test_an_update_that_does_harm_is_not_kept(place, monkeypatch, capsys):
     believing(monkeypatch, "removed")
     monkeypatch.setattr(update, "untouched_psnr", lambda *a: [30.0, 28.0])
@@ -234,3 +260,54 @@ def test_a_killed_training_is_no_workspace_and_can_be_repeated(place):
     assert list(place.glob("out/.part-*")) and not (place / "out/refield.json").exists()
     assert main(["train", "data", "out", *TINY_FIT]) == 0
     assert not list(place.glob("out/.part-*"))
+
+
+_KILLED = """
+import os, signal, sys
+import pytest, torch
+from refield import workspace
+from refield.cli import main
+from refield.commands import update
+from tests.test_cli import FEW, believing
+
+name, when = sys.argv[1:]
+home = workspace if name.startswith("sync") else update
+whole = getattr(home, name)
+
+def killed(*args):
+    if when == "after":
+        whole(*args)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+setattr(home, name, killed)
+update.MOST_LOST = 100.0
+believing(pytest.MonkeyPatch(), "removed")
+main(["update", "work", "new", *FEW])
+"""
+
+
+@pytest.mark.parametrize(
+    "name, when, complete",
+    [
+        ("save_updated", "before", False),
+        ("write_report", "after", False),
+        ("sync", "after", False),
+        ("sync_folder", "before", True),
+    ],
+)
+def test_a_killed_update_leaves_the_workspace_as_it_was_or_complete(place, monkeypatch, name, when, complete):
+    before = contents(place / "work")
+    (place / "killed.py").write_text(_KILLED)
+    done = subprocess.run([sys.executable, "killed.py", name, when], cwd=place, env=HERE, stderr=subprocess.DEVNULL)
+    assert done.returncode == -signal.SIGKILL
+    visible = {k: v for k, v in contents(place / "work").items() if ".part-" not in k}
+    if complete:
+        assert (place / "work/visits/001/report.html").is_file() and (place / "work/visits/001/field.json").is_file()
+        assert main(["undo", "work"]) == 0
+        assert contents(place / "work") == before
+    else:
+        assert visible == before
+    monkeypatch.setattr(update, "MOST_LOST", 100.0)
+    believing(monkeypatch, "removed")
+    assert main(["update", "work", "new", *FEW]) == 0  # and clears away what the killed one left
+    assert not list(place.glob("work/**/.part-*"))

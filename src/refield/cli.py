@@ -19,6 +19,8 @@ COMMANDS = {
     "demo": "sample capture → field → update → report; no downloads, on a CPU",
     "train": "photos with camera poses → a field in a workspace",
     "update": "a few new photos → what changed, and the field brought up to date",
+    "visits": "what changed at each update of a workspace",
+    "undo": "take the last update back",
     "render": "pictures from any camera, before or after",
     "evaluate": "PSNR and SSIM on photos the field has never seen",
     "synth": "path-trace a world that is known exactly (needs the extra 'synth')",

@@ -189,6 +189,13 @@ class Workspace:
             part.rename(self.visit(self.visits + 1))
             sync_folder(base)
 
+    def drop_last_visit(self) -> None:
+        """Remove the latest visit, whole: it goes out of sight by one rename. Call under the lock."""
+        base, last = self.path / "visits", self.visit(self.visits)
+        with part_folder(base) as part:
+            last.rename(part / last.name)
+            sync_folder(base)
+
     def keep_change(self, folder: Path, change: SceneChange) -> SceneChange:
         """Copy the used photos into a visit's folder and write the change; the change with the copies.
 

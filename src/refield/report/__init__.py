@@ -4,13 +4,15 @@ Built from plain facts and pictures, so that whoever joins the stages decides wh
 """
 
 from refield.report.pictures import write_contact_sheet
-from refield.report.visit import Comparison, VisitReport, summary, visit_report_dict
+from refield.report.visit import Comparison, VisitReport, object_shift, summary, turn, visit_report_dict
 from refield.report.write import write_report
 
 __all__ = [
     "Comparison",
     "VisitReport",
+    "object_shift",
     "summary",
+    "turn",
     "visit_report_dict",
     "write_contact_sheet",
     "write_report",

@@ -7,6 +7,7 @@ import platform
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any
 
@@ -130,6 +131,7 @@ def visit_report_dict(report: VisitReport) -> dict[str, Any]:
     """The content of ``report.json``: everything but the pictures; only what JSON can hold (no NaN)."""
     return {
         "title": report.title,
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "summary": summary(report.change),
         "why": report.change.why,
         "objects": [_object_dict(o) for o in report.change.objects],
