@@ -1,12 +1,13 @@
 """The updated field: the old one, looked up where things were, and a helper where they no longer are (Eqs. 4, 5).
 
-Who answers for a point: an object that moved in (Eq. 3), else the helper inside its region, else the old field in
-the new light. Without a helper the old objects are cut out: nothing is left inside them.
+Who answers for a point: an object that moved in (Eq. 3), else the helper inside its region, else an earlier state that
+knows what is there (`refield.update.recall`), else the old field in the new light. Without a helper the old objects are
+cut out: nothing is left inside them.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -29,6 +30,35 @@ SKIN = 1.0
 """How much further than its grid a moved object reaches, in samples of the old field"""
 
 NOWHERE = Region(())
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where an object of a change comes from: object ``index`` of the change that is ``layer`` updates before this."""
+
+    object: int
+    layer: int
+    index: int
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """What an update takes from earlier visits in place of learning it."""
+
+    undone: tuple[Origin, ...] = ()
+    """Objects that are back where the field without that earlier change shows them; it is the one wrapped"""
+    left: tuple[Origin, ...] = ()
+    """Objects that left a place to which that earlier change had brought them"""
+    places: Region = NOWHERE
+    """these places, widely"""
+    ground: Field | None = None
+    """shows them without the objects"""
+
+    def __bool__(self) -> bool:
+        return bool(self.undone or self.left)
+
+
+NOTHING_EARLIER = Earlier()
 _SOLID = 0.05  # opacity of a sample that was not empty before
 _PROBES = 8  # points a cell looked up when the sampler is recomputed: a moved surface crosses cells at any angle
 
@@ -48,6 +78,8 @@ class UpdatedField:
         eyes: Tensor | None = None,
         bare: Region = NOWHERE,
         sampler: OccupancySampler | None = None,
+        earlier: Earlier = NOTHING_EARLIER,
+        skipped: frozenset[int] = frozenset(),
     ) -> None:
         """What a visit adds to the old field.
 
@@ -55,27 +87,35 @@ class UpdatedField:
         objects' own grids and their skin by default). ``light`` changes what stood still, ``shading`` each moved
         object, at its old place. ``eyes`` (C, 3) are the centres of the old cameras: moved objects are not asked
         along directions that none of them looked along. ``bare``, a part of the region, goes before what moved in.
-        ``sampler`` is recomputed where things changed unless it is given.
+        ``sampler`` is recomputed where things changed unless it is given. ``earlier`` says what earlier visits know;
+        the change's objects that it names as undone, and those in ``skipped``, are as the old field shows them.
         """
+        self.earlier, self.skipped = earlier, skipped | {origin.object for origin in earlier.undone}
         self.pretrained, self.change, self.helper, self.light = pretrained, change, helper, light
         self.shading, self.eyes, self.bare = shading, eyes, bare
         self.why_stopped = ""
         """what ended the helper's training, in words; empty if it was not trained here"""
         if region is None:
-            region = carved(change, SKIN * pretrained.sampler.step) if helper is None else move_out(change, DILATION)
+            rest = self.to_learn
+            region = carved(rest, SKIN * pretrained.sampler.step) if helper is None else move_out(rest, DILATION)
         self.region = region
-        self.moves: tuple[Move, ...] = moves_of(change)
+        self.moves: tuple[Move, ...] = moves_of(_part(change, self.skipped))
         self._shells = tuple(Move(grown(m.grid, SKIN * pretrained.sampler.step), m.new_from_old) for m in self.moves)
         self._outlooks = [] if eyes is None else [Outlook.from_eyes(eyes, m.grid) for m in self.moves]
         self.sampler_step = pretrained.sampler.step
-        self.boxes = tuple(m.box_now for m in self._shells) + region.boxes
+        self.boxes = tuple(m.box_now for m in self._shells) + region.boxes + earlier.places.boxes
         if sampler is None:
             sampler = pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES)
         self.sampler = sampler
         self._base: HashField | None = _base_of(pretrained)
         self._retold = self._retold_cells()
-        earlier = pretrained._marched if isinstance(pretrained, UpdatedField) else ()
-        self._marched: tuple[Tensor, ...] = tuple(_by_cells(self.sampler, b) for b in self.boxes) + earlier
+        before = pretrained._marched if isinstance(pretrained, UpdatedField) else ()
+        self._marched: tuple[Tensor, ...] = tuple(_by_cells(self.sampler, b) for b in self.boxes) + before
+
+    @property
+    def to_learn(self) -> SceneChange:
+        """The change without the objects about which an earlier visit knows everything."""
+        return _part(self.change, self.skipped | {origin.object for origin in self.earlier.left})
 
     def samples(self, rays: Rays, jitter: bool = False) -> Samples:
         """Where to evaluate the field along rays; nothing behind the first opaque surface that never changed.
@@ -106,9 +146,10 @@ class UpdatedField:
         for box in self.boxes:
             cells = self.sampler.cells_in(box)
             x = self.sampler.points_in(cells, jitter=False)
-            _, _, owner, _, new = self._route(x, torch.zeros_like(x))
-            told = owner >= 0
-            told[new] = True
+            to = self._route(x, torch.zeros_like(x))
+            told = to.owner >= 0
+            told[to.helper] = True
+            told[to.ground] = True
             grid.view(-1)[cells[told]] = 1
         # a cell whose centre is just outside may hold a corner that is inside
         return functional.max_pool3d(grid[None, None].float(), 3, 1, 1)[0, 0].to(torch.uint8)
@@ -116,42 +157,48 @@ class UpdatedField:
     def density(self, x: Tensor) -> Tensor:
         """World points (..., 3) -> sigma (...,), per world unit."""
         flat = x.reshape(-1, 3)
-        asked, _, _, old, new = self._route(flat, torch.zeros_like(flat))
-        sigma = flat.new_zeros(len(flat)).index_copy(0, old, self.pretrained.density(asked[old]))
-        if self.helper is not None and len(new):
-            sigma = sigma.index_copy(0, new, self.helper.density(flat[new]))
+        to = self._route(flat, torch.zeros_like(flat))
+        sigma = flat.new_zeros(len(flat)).index_copy(0, to.old, self.pretrained.density(to.asked[to.old]))
+        for field, rows in ((self.helper, to.helper), (self.earlier.ground, to.ground)):
+            if field is not None and len(rows):
+                sigma = sigma.index_copy(0, rows, field.density(flat[rows]))
         return sigma.reshape(x.shape[:-1])
 
     def __call__(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """World points (..., 3) and unit directions (..., 3) -> sigma (...,) and rgb (..., 3) in [0, 1] (Eq. 5)."""
         flat, along = x.reshape(-1, 3), d.reshape(-1, 3)
-        asked, turned, owner, old, new = self._route(flat, along)
-        s, c = self.pretrained(asked[old], turned[old])
-        c = self._relit(asked[old], c, owner[old])
-        sigma = flat.new_zeros(len(flat)).index_copy(0, old, s)
-        rgb = torch.zeros_like(flat).index_copy(0, old, c)
-        if self.helper is not None and len(new):
-            s, c = self.helper(flat[new], along[new])
-            sigma, rgb = sigma.index_copy(0, new, s), rgb.index_copy(0, new, c)
+        to = self._route(flat, along)
+        s, c = self.pretrained(to.asked[to.old], to.turned[to.old])
+        c = self._relit(to.asked[to.old], c, to.owner[to.old])
+        sigma = flat.new_zeros(len(flat)).index_copy(0, to.old, s)
+        rgb = torch.zeros_like(flat).index_copy(0, to.old, c)
+        if self.helper is not None and len(to.helper):
+            s, c = self.helper(flat[to.helper], along[to.helper])
+            sigma, rgb = sigma.index_copy(0, to.helper, s), rgb.index_copy(0, to.helper, c)
+        if self.earlier.ground is not None and len(to.ground):
+            s, c = self.earlier.ground(flat[to.ground], along[to.ground])
+            c = self._relit(flat[to.ground], c, to.owner[to.ground])
+            sigma, rgb = sigma.index_copy(0, to.ground, s), rgb.index_copy(0, to.ground, c)
         return sigma.reshape(x.shape[:-1]), rgb.reshape(x.shape)
 
-    def _route(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Where and along what to ask (S, 3), which move did it (S,), and the rows that the old field and the
-        helper answer for; rows in neither are empty space."""
+    def _route(self, x: Tensor, d: Tensor) -> _Routed:
+        """Who answers for world points (S, 3) and directions (S, 3)."""
         owner = torch.full(x.shape[:1], -1, dtype=torch.long, device=x.device)
-        inside = torch.zeros(len(x), dtype=torch.bool, device=x.device)
         near = self._near(x.detach()).nonzero()[:, 0]
         if len(near) == 0:
-            return x, d, owner, torch.arange(len(x), device=x.device), near
+            return _Routed(x, d, owner, torch.arange(len(x), device=x.device), near, near)
         mover = self.arrived(x[near])
         owner[near] = mover
-        inside[near] = (mover < 0) & self.region.contains(x[near])
+        helped = (mover < 0) & self.region.contains(x[near])
+        grounded = (mover < 0) & ~helped & self.earlier.places.contains(x[near])
         at, along = looked_up(x[near], d[near], mover, [m.old_from_new for m in self.moves])
         for i, outlook in enumerate(self._outlooks):
             mine = (mover == i).nonzero()[:, 0]
             along = along.index_copy(0, mine, outlook.held(at[mine], along[mine]))
         asked, turned = x.index_copy(0, near, at), d.index_copy(0, near, along)
-        return asked, turned, owner, (~inside).nonzero()[:, 0], inside.nonzero()[:, 0]
+        old = torch.ones(len(x), dtype=torch.bool, device=x.device)
+        old[near] = ~(helped | grounded)
+        return _Routed(asked, turned, owner, old.nonzero()[:, 0], near[helped], near[grounded])
 
     def arrived(self, x: Tensor) -> Tensor:
         """Which move each world point (S, 3) is answered by, (S,) int64, -1 for none.
@@ -165,7 +212,7 @@ class UpdatedField:
         if len(rows):
             at = x[rows].detach()
             solid = self.pretrained.density(at) * self.sampler_step > _SOLID
-            free = ~solid | self.region.contains(at)
+            free = ~solid | self.region.contains(at) | self.earlier.places.contains(at)
             owner[rows[free]] = skin[rows[free]]
         return torch.where(self.bare.contains(x), -1, owner) if self.bare.grids else owner
 
@@ -182,6 +229,30 @@ class UpdatedField:
             if light is not None:
                 rgb = torch.where((owner == i)[:, None], light.applied(asked, rgb), rgb)
         return rgb
+
+
+@dataclass(frozen=True)
+class _Routed:
+    """Who answers for S points."""
+
+    asked: Tensor
+    """(S, 3) world: where the old field is asked"""
+    turned: Tensor
+    """(S, 3) unit: along what"""
+    owner: Tensor
+    """(S,) int64: the move that brought what is there; -1 for none"""
+    old: Tensor
+    """rows, int64, that the old field answers for"""
+    helper: Tensor
+    """rows of the helper; of nobody where there is none"""
+    ground: Tensor
+    """rows of the earlier state that knows the place"""
+
+
+def _part(change: SceneChange, without: frozenset[int]) -> SceneChange:
+    """A change without some of its objects."""
+    kept = tuple(o for i, o in enumerate(change.objects) if i not in without)
+    return change if len(kept) == len(change.objects) else replace(change, objects=kept)
 
 
 def _base_of(field: Field) -> HashField | None:

@@ -12,8 +12,9 @@ from refield.artefacts import read_tensors, write_tensors
 from refield.field.radiance import Field, HashField
 from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.errors import InputError
-from refield.update.composite import UpdatedField
+from refield.update.composite import Earlier, Origin, UpdatedField
 from refield.update.light import Relighting
+from refield.update.recall import ground_of, without
 from refield.update.region import Region
 
 _REMEDY = "restore the visit, or remove it and update again"
@@ -33,6 +34,10 @@ def save_updated(folder: Path, field: UpdatedField) -> None:
         "helper": None,
     }
     tensors |= _region_out("region", field.region) | _region_out("bare", field.bare)
+    tensors |= _region_out("places", field.earlier.places)
+    facts["places"] = len(field.earlier.places.grids)
+    facts["undone"] = [[o.object, o.layer, o.index] for o in field.earlier.undone]
+    facts["left"] = [[o.object, o.layer, o.index] for o in field.earlier.left]
     if field.eyes is not None:
         tensors["eyes"] = field.eyes
     facts["shading"] = len(field.shading)
@@ -50,6 +55,8 @@ def save_updated(folder: Path, field: UpdatedField) -> None:
 def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> UpdatedField:
     """The updated field that `save_updated` wrote, over the field and the change that it was made from.
 
+    Moves that it took back are taken back again.
+
     Raises:
         InputError: a file is missing, damaged, or of another shape.
     """
@@ -62,10 +69,11 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
         own = {name.removeprefix("helper."): t for name, t in tensors.items() if name.startswith("helper.")}
         helper = HashField.from_state(own, facts["helper"]) if facts["helper"] is not None else None
         sampler = replace(pretrained.sampler, grid=tensors["occupancy"])
+        base, earlier = _earlier_in(tensors, facts, pretrained)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(folder, f"does not describe an updated field ({error})", _REMEDY) from None
     return UpdatedField(
-        pretrained,
+        base,
         change,
         helper,
         region=region,
@@ -74,7 +82,17 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
         eyes=tensors.get("eyes"),
         bare=bare,
         sampler=sampler,
+        earlier=earlier,
     )
+
+
+def _earlier_in(tensors: dict[str, Tensor], facts: dict[str, Any], field: Field) -> tuple[Field, Earlier]:
+    """What the update took from earlier visits, and ``field`` without the moves that it took back."""
+    undone, left = (tuple(Origin(*map(int, o)) for o in facts.get(name, ())) for name in ("undone", "left"))
+    for origin in undone:
+        field = without(field, origin, departed=False)
+    places = _region_in("places", facts.get("places", 0), tensors)
+    return field, Earlier(undone, left, places, ground_of(field, left))
 
 
 def _region_out(name: str, region: Region) -> dict[str, Tensor]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -21,12 +22,14 @@ from refield.scene.pose import transform
 from refield.update.bare import bare_skin
 from refield.update.composite import UpdatedField, leaving
 from refield.update.config import UpdateConfig
+from refield.update.evidence import as_remembered, recalled_pixels
 from refield.update.fit_helper import HelperTraining, Lit, UpdateProgress
 from refield.update.frozen import composite_once
 from refield.update.helper import new_helper, step_near
 from refield.update.light import Relighting, Sightings, fit_light
+from refield.update.recall import earlier_of
 from refield.update.region import Region, meets, move_out
-from refield.update.supervision import Lessons, Places, changed_pixels, new_lessons, old_ring, places_of
+from refield.update.supervision import Lessons, changed_pixels, new_lessons, old_ring, places_of
 from refield.vision.pixels import dilate
 
 DEFAULTS = UpdateConfig()
@@ -56,27 +59,38 @@ def update_field(
     torch.manual_seed(config.seed)
     say("move")
     eyes = centres(capture.train).float()
-    cut = UpdatedField(field, change, eyes=eyes)
+    base, earlier = earlier_of(field, change, config.dilation)
+    cut = UpdatedField(base, change, eyes=eyes, earlier=earlier)
     if not change.objects or not change.frames:
         return cut
-    bare = bare_skin(cut, capture.train, change)
-    if bare.grids:
-        cut = UpdatedField(field, change, region=Region(cut.region.grids + bare.grids), eyes=eyes, bare=bare)
+    known = _known_of(capture, field, cut)
+    cut = known.cut
     say("light")
-    places = places_of(change)
-    changed = [changed_pixels(change, places, i, f) for i, f in enumerate(change.frames)]
-    sparse = new_lessons(change.frames, cut, changed)
-    light = _light(sparse, field, change, changed) if config.relight else None
-    shading = _shading(sparse, cut, change) if config.relight else ()
+    light = _light(known) if config.relight else None
+    shading = _shading(known.sparse, cut, change) if config.relight else ()
+    lit = partial(
+        UpdatedField,
+        cut.pretrained,
+        change,
+        light=light,
+        shading=shading,
+        eyes=cut.eyes,
+        bare=cut.bare,
+        earlier=cut.earlier,
+    )
+    wide = Region(move_out(cut.to_learn, config.dilation).grids + cut.bare.grids)
+    if not wide.grids:
+        updated = lit(region=wide)
+        updated.why_stopped = "earlier visits know all of it"
+        return updated
     say("supervise")
-    wide = Region(move_out(change, config.dilation).grids + bare.grids)
     region = _in_reach(wide.sampler(step_near(field, wide.box.mean(0))), capture.train + change.frames)
-    old = _old_lessons(capture, field, places, region, config, light)
-    sparse = sparse[meets(region, sparse.rays).nonzero()[:, 0]]
+    old = _old_lessons(capture, cut, region, config, light)
+    sparse = known.sparse[meets(region, known.sparse.rays).nonzero()[:, 0]]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
     say("freeze")
-    frozen = UpdatedField(field, change, region=wide, light=light, shading=shading, eyes=eyes, bare=bare)
+    frozen = lit(region=wide)
     new_taught, judge = _split(Lit(sparse, composite_once(frozen, region, sparse.rays)), config.held_out)
     old_taught = Lit(old, composite_once(frozen, region, old.rays))
     say("train")
@@ -85,9 +99,36 @@ def update_field(
     run.run(on_progress)
     say("show")
     helper.requires_grad_(False)
-    updated = UpdatedField(field, change, helper, region=wide, light=light, shading=shading, eyes=eyes, bare=bare)
+    updated = lit(helper=helper, region=wide)
     updated.why_stopped = run.why_stopped
     return updated
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What there is before anything is learnt."""
+
+    cut: UpdatedField
+    """the old field, with the objects moved and cut out, and what earlier visits know"""
+    sparse: Lessons
+    """all pixels of the new photos"""
+    changed: tuple[np.ndarray, ...]
+    """of each new photo, (H, W) bool: what arrived or left"""
+
+
+def _known_of(capture: Capture, field: Field, cut: UpdatedField) -> _Known:
+    """What is known, once the new photos have been asked about what is only remembered."""
+    change, eyes = cut.change, cut.eyes
+    places = places_of(change)
+    changed = tuple(changed_pixels(change, places, i, f) for i, f in enumerate(change.frames))
+    sparse = new_lessons(change.frames, cut, changed)
+    if cut.earlier and not as_remembered(cut, sparse, changed):
+        cut = UpdatedField(field, change, eyes=eyes)
+    bare = bare_skin(cut, capture.train, change)
+    if bare.grids:
+        empty = Region(cut.region.grids + bare.grids)
+        cut = UpdatedField(cut.pretrained, change, region=empty, eyes=eyes, bare=bare, earlier=cut.earlier)
+    return _Known(cut, sparse, changed)
 
 
 def _split(lit: Lit, every: int) -> tuple[Lit, Lit]:
@@ -106,15 +147,17 @@ def _in_reach(region: OccupancySampler, frames: tuple[Frame, ...]) -> OccupancyS
     return replace(region, far=furthest / space.radius + 2)
 
 
-def _light(sparse: Lessons, field: Field, change: SceneChange, changed: list[np.ndarray]) -> Relighting | None:
-    """The light on what did not change, from the new photos' pixels that show it; each photo is a fold."""
+def _light(known: _Known) -> Relighting | None:
+    """The light on what is known, from the new photos' pixels that show it; each photo is a fold."""
+    change, sparse = known.cut.change, known.sparse
     box = Region(tuple(g for o in change.objects for g in (o.grid, o.grid_now) if g is not None)).box
     side = max(float((o.grid.tight_aabb().diff(dim=0)).max()) for o in change.objects)
     box = torch.stack([box[0] - 1.5 * side, box[1] + 1.5 * side])
-    still = torch.cat([torch.from_numpy(~dilate(c, math.ceil(0.01 * c.shape[1]))).reshape(-1) for c in changed])
+    unknown = [c & ~recalled_pixels(known.cut, f) for c, f in zip(known.changed, change.frames)]
+    still = torch.cat([torch.from_numpy(~dilate(c, math.ceil(0.01 * c.shape[1]))).reshape(-1) for c in unknown])
     may = (still & (leaving(sparse.rays, box) > 0)).nonzero()[:, 0]
     seen = sparse[may[torch.randperm(len(may))[:_LIT_RAYS].sort().values]]
-    was = render_many(field, seen.rays)
+    was = render_many(known.cut, seen.rays)
     x = seen.rays.origins + seen.rays.directions * was.depth[:, None]
     solid = (was.opacity > 0.9).nonzero()[:, 0]
     return fit_light(Sightings(x, seen.rgb, was.rgb, seen.photo)[solid], box, 1.5 * _pixel(change, box.mean(0)))
@@ -148,15 +191,10 @@ def _shading(sparse: Lessons, cut: UpdatedField, change: SceneChange) -> tuple[R
 
 
 def _old_lessons(
-    capture: Capture,
-    field: Field,
-    places: Places,
-    region: OccupancySampler,
-    config: UpdateConfig,
-    light: Relighting | None,
+    capture: Capture, cut: UpdatedField, region: OccupancySampler, config: UpdateConfig, light: Relighting | None
 ) -> Lessons:
     """Ring pixels of the old photos whose rays meet the region, in the new light."""
-    bank = PixelBank(capture.train)
+    bank, places = PixelBank(capture.train), places_of(cut.change)
     chosen = []
     for i, frame in enumerate(capture.train):
         ring = old_ring(places, i, frame, config.shadow, config.far)
@@ -167,6 +205,6 @@ def _old_lessons(
     pixels = pixels[torch.randperm(len(pixels))[:_RING_RAYS]].sort().values
     rays, rgb = bank.rays(pixels), bank.colours(pixels)
     if light is not None:
-        was = render_many(field, rays)
+        was = render_many(cut.pretrained, rays)
         rgb = light.applied(rays.origins + rays.directions * was.depth[:, None], rgb)
     return Lessons(rays, rgb, torch.full((len(rgb),), -1))

@@ -1,0 +1,57 @@
+"""Do the new photos agree with what earlier visits know of a place (`refield.update.recall`)?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from refield.field.render import render_many
+from refield.scene.capture import Frame, camera_rays
+from refield.update.composite import UpdatedField
+from refield.update.region import Region, meets
+from refield.update.supervision import Lessons
+
+_PIXELS = 20_000  # compared
+# What an earlier visit says of a place may be so many times as wrong as what did not change (a helper's ground, a
+# shadow that went), and so much more: squared error, 26 dB
+_TRUST, _BLUNDER = 3.0, 2.5e-3
+
+
+def as_remembered(cut: UpdatedField, sparse: Lessons, changed: Sequence[np.ndarray]) -> bool:
+    """Whether the new photos show what earlier visits say is there, about as well as what did not change at all.
+
+    ``sparse`` are all pixels of the change's photos in order, ``changed`` their changed ones, (H, W) bool each.
+    """
+    known = torch.cat([torch.from_numpy(recalled_pixels(cut, f)).reshape(-1) for f in cut.change.frames])
+    still = ~torch.cat([torch.from_numpy(c).reshape(-1) for c in changed])
+    recalled, same = (_error(cut, sparse, which) for which in (known, still))
+    return recalled < _TRUST * same + _BLUNDER
+
+
+def recalled_pixels(cut: UpdatedField, frame: Frame) -> np.ndarray:
+    """Pixels of a new photo that show what only an earlier visit knows, (H, W) bool."""
+    objects, earlier = cut.change.objects, cut.earlier
+    if not earlier:
+        return np.zeros((frame.camera.height, frame.camera.width), bool)
+    known = [objects[p.object].grid for p in earlier.undone + earlier.left]
+    known += [now for p in earlier.undone if (now := objects[p.object].grid_now) is not None]
+    other = [m.grid.moved(m.new_from_old) for m in cut.moves] + [o.grid for o in cut.to_learn.objects]
+    return _silhouette(Region(tuple(known)), frame) & ~_silhouette(Region(tuple(other)), frame)
+
+
+def _error(field: UpdatedField, seen: Lessons, which: torch.Tensor) -> float:
+    """Mean squared error of some of the pixels; 0 if there are none."""
+    rows = which.nonzero()[:, 0]
+    some = seen[rows[torch.randperm(len(rows))[:_PIXELS]]]
+    return float((render_many(field, some.rays).rgb - some.rgb).square().mean()) if len(rows) else 0.0
+
+
+def _silhouette(region: Region, frame: Frame) -> np.ndarray:
+    shape = (frame.camera.height, frame.camera.width)
+    if not region.grids:
+        return np.zeros(shape, bool)
+    size = float((region.box[1] - region.box[0]).max())
+    rays = camera_rays(frame.camera, frame.world_from_cam)
+    return meets(region.sampler(size / 100, resolution=128), rays).reshape(shape).numpy()

@@ -1,0 +1,183 @@
+"""What earlier visits know about a place: an object that came with a visit and leaves again uncovers what was there.
+
+A second move of the same object has nothing to learn (§11.3.2): the field without that object's arrival shows the
+ground it stood on, and an object that is back where it was is the field without its move. Layers: the update wrapped
+outermost is 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from refield.field.radiance import Field
+from refield.field.warp import Move, inside_box, outline
+from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
+from refield.scene.pose import transform
+from refield.update.composite import Earlier, Origin, UpdatedField
+from refield.update.region import Region, move_out
+
+_SAME = 0.5  # of one grid's nodes that lie in the other
+_BACK = 0.06  # of an object's mean side: so near to its old place it may be back there; the photos decide
+_NODES = 500  # asked of a grid
+
+
+def earlier_of(field: Field, change: SceneChange, dilation: float) -> tuple[Field, Earlier]:
+    """What earlier visits know of a change, and the field without the moves that it takes back.
+
+    Only proposed: whoever asks compares with the photos.
+    """
+    base, undone, left = field, [], []
+    for k, o in enumerate(change.objects):
+        found = _taken_back(base, o)
+        if found is not None:
+            undone.append(Origin(k, *found))
+            base = without(base, undone[-1], departed=False)
+    for k, o in enumerate(change.objects):
+        brought = None if o.kind == "added" or k in {u.object for u in undone} else _brought(base, o.grid)
+        if brought is not None:
+            left.append(Origin(k, *brought))
+    places = move_out(replace(change, objects=tuple(change.objects[p.object] for p in left)), dilation)
+    return base, Earlier(tuple(undone), tuple(left), places, ground_of(base, tuple(left)))
+
+
+def ground_of(field: Field, left: tuple[Origin, ...]) -> Field | None:
+    """A field without the arrivals of objects that left; None if none did. Layers are those of ``field``."""
+    if not left:
+        return None
+    ground = field
+    for place in sorted(left, key=lambda p: -p.layer):  # the innermost first: an edit may take a whole layer away
+        ground = without(ground, place, departed=True)
+    return ground
+
+
+def without(field: Field, origin: Origin, *, departed: bool) -> Field:
+    """A field as if an object of an earlier change had not arrived; if not ``departed``, as if it had not changed.
+
+    Raises:
+        ValueError: ``field`` has no such layer.
+    """
+    if not isinstance(field, UpdatedField):
+        raise ValueError("the field has not had so many changes")
+    if origin.layer:
+        inner = without(field.pretrained, replace(origin, layer=origin.layer - 1), departed=departed)
+        return _rebuilt(field, inner)
+    own = origin.index
+    o = field.change.objects[own]
+    moving = [k for k, q in enumerate(field.change.objects) if q.new_from_old is not None and k not in field.skipped]
+    shading = tuple(s for k, s in zip(moving, field.shading) if k != own)
+    bare = _bare_of(field, o)
+    region = Region(tuple(g for g in field.region.grids if not _among(g, bare)))
+    kept = Region(tuple(g for g in field.bare.grids if not _among(g, bare)))
+    if departed and o.kind == "moved":
+        gone = ObjectChange("removed", o.grid, masks=o.masks, confidence=o.confidence, note=o.note)
+        objects = tuple(gone if k == own else q for k, q in enumerate(field.change.objects))
+        return _rebuilt(field, field.pretrained, change=replace(field.change, objects=objects), region=region,
+                        bare=kept, shading=shading)  # fmt: skip
+    skipped = field.skipped | {own}
+    if len(skipped) == len(field.change.objects):
+        return field.pretrained
+    ours = [p for p in field.earlier.left if p.object == own]
+    earlier = replace(field.earlier, left=tuple(p for p in field.earlier.left if p.object != own))
+    if ours:
+        earlier = replace(earlier, places=_less(earlier.places, o.grid, kept))
+    else:
+        region = _less(region, o.grid, kept)
+    return _rebuilt(field, field.pretrained, region=region, bare=kept, shading=shading, earlier=earlier,
+                    skipped=skipped)  # fmt: skip
+
+
+def _rebuilt(field: UpdatedField, inner: Field, **changed: object) -> UpdatedField:
+    """The same update over another field, with other parts."""
+    parts: dict[str, object] = {
+        "change": field.change,
+        "region": field.region,
+        "light": field.light,
+        "shading": field.shading,
+        "eyes": field.eyes,
+        "bare": field.bare,
+        "earlier": field.earlier,
+        "skipped": field.skipped,
+    } | changed
+    change = parts.pop("change")
+    return UpdatedField(inner, change, field.helper, **parts)  # type: ignore[arg-type]
+
+
+def _brought(field: Field, place: OccupancyGrid) -> tuple[int, int] | None:
+    """The layer and index of the object that an earlier change brought to a place."""
+    layer = 0
+    while isinstance(field, UpdatedField):
+        for i, o in enumerate(field.change.objects):
+            there = None if i in field.skipped else o.grid_now
+            if there is not None and _part_in(place, there) > _SAME:
+                return layer, i
+        field, layer = field.pretrained, layer + 1
+    return None
+
+
+def _taken_back(field: Field, o: ObjectChange) -> tuple[int, int] | None:
+    """The layer and index of an earlier object whose change this one takes back: it is where it was, or not at all."""
+    if o.kind == "added":
+        return _removed_from(field, o.grid)
+    found = _brought(field, o.grid)
+    if found is None:
+        return None
+    q = _object(field, *found)
+    if o.new_from_old is None or q.new_from_old is None:
+        return found if o.kind == "removed" and q.kind == "added" else None
+    corners = torch.cartesian_prod(*outline(q.grid).T.double())
+    off = transform(o.new_from_old @ q.new_from_old, corners) - corners
+    box = q.grid.tight_aabb()
+    reach = max(_BACK * float((box[1] - box[0]).mean()), 2 * field.sampler.step)
+    return found if float(off.norm(dim=-1).max()) < reach else None
+
+
+def _removed_from(field: Field, place: OccupancyGrid) -> tuple[int, int] | None:
+    layer = 0
+    while isinstance(field, UpdatedField):
+        for i, o in enumerate(field.change.objects):
+            here = o.kind == "removed" and i not in field.skipped
+            if here and min(_part_in(place, o.grid), _part_in(o.grid, place)) > _SAME:
+                return layer, i
+        field, layer = field.pretrained, layer + 1
+    return None
+
+
+def _object(field: Field, layer: int, index: int) -> ObjectChange:
+    for _ in range(layer):
+        assert isinstance(field, UpdatedField)  # the layer was counted on it
+        field = field.pretrained
+    assert isinstance(field, UpdatedField)
+    return field.change.objects[index]
+
+
+def _part_in(grid: OccupancyGrid, other: OccupancyGrid) -> float:
+    """The part of a grid's occupied nodes that lies in another."""
+    x = grid.occupied()
+    x = x[:: max(1, len(x) // _NODES)]
+    return float(other.contains(x).float().mean()) if len(x) else 0.0
+
+
+def _bare_of(field: UpdatedField, o: ObjectChange) -> list[Tensor]:
+    """The boxes of the bare parts that belong to where an object moved in."""
+    if o.new_from_old is None:
+        return []
+    box = Move(o.grid, o.new_from_old).box_now
+    return [g.aabb for g in field.bare.grids if bool(inside_box(g.aabb.mean(0, keepdim=True), box))]
+
+
+def _among(grid: OccupancyGrid, boxes: list[Tensor]) -> bool:
+    return any(torch.equal(grid.aabb, box) for box in boxes)
+
+
+def _less(region: Region, grid: OccupancyGrid, but: Region) -> Region:
+    """A region without the grid that was made around an object's; ``but`` are never taken."""
+    kept = [g.aabb for g in but.grids]
+    centre = grid.tight_aabb().mean(0)
+    own = [g for g in region.grids if not _among(g, kept)]
+    if not own:
+        return region
+    nearest = min(own, key=lambda g: float((g.tight_aabb().mean(0) - centre).norm()))
+    return Region(tuple(g for g in region.grids if g is not nearest))

@@ -1,0 +1,125 @@
+"""What an earlier visit knew is not learnt again, and a move that is taken back gives the old pictures back."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from refield.field.render import render_rays
+from refield.scene.capture import Rays
+from refield.scene.change import ObjectChange, SceneChange
+from refield.scene.pose import invert
+from refield.update.composite import Origin, UpdatedField
+from refield.update.recall import earlier_of, without
+from refield.update.store import load_updated, save_updated
+from tests.fields import small_field
+from tests.update.worlds import Ball, BallWorld, at, grid_of, moved, views
+
+HERE, THERE, BEYOND = at(-0.5, 0, 0.25), at(0.4, 0.3, 0.25, 1.0), at(0.3, -0.6, 0.25, 2.0)
+
+
+def ball(where=HERE) -> Ball:
+    return Ball(where, 0.25)
+
+
+def first_visit() -> tuple[BallWorld, UpdatedField]:
+    """A ball went from HERE to THERE; the helper knows the floor."""
+    before, after = BallWorld((ball(),)), BallWorld((ball(THERE),))
+    change = SceneChange((moved(ball(), THERE),))
+    return before, UpdatedField(before, change, helper=after)
+
+
+def next_move(to: torch.Tensor) -> ObjectChange:
+    """The same ball, as a later estimate finds it: from THERE."""
+    return ObjectChange("moved", grid_of(ball(THERE)), to @ invert(THERE))
+
+
+def test_a_second_move_uncovers_what_was_there():
+    _, now = first_visit()
+    change = SceneChange((next_move(BEYOND),))
+    base, earlier = earlier_of(now, change, 1.5)
+    assert base is now and earlier.left == (Origin(0, 0, 0),) and not earlier.undone
+    again = UpdatedField(base, change, earlier=earlier)
+    assert again.to_learn.objects == ()
+    truth = BallWorld((ball(BEYOND),))
+    rays = views()
+    error = (render_rays(again, rays).rgb - render_rays(truth, rays).rgb).abs()
+    assert float(error.mean()) < 0.01
+    assert float((error.amax(-1) > 0.2).float().mean()) < 0.02  # edges
+
+
+def test_a_move_that_is_taken_back_gives_the_old_pictures_back():
+    before, now = first_visit()
+    home = HERE.clone()
+    home[:3, 3] += 0.004  # an estimate is not exact
+    change = SceneChange((next_move(home),))
+    base, earlier = earlier_of(now, change, 1.5)
+    assert base is before and earlier.undone == (Origin(0, 0, 0),)
+    back = UpdatedField(base, change, earlier=earlier)
+    rays = views()
+    assert torch.equal(render_rays(back, rays).rgb, render_rays(before, rays).rgb)
+
+
+def test_what_was_removed_and_is_put_back():
+    before = BallWorld((ball(), ball(BEYOND)))
+    gone = SceneChange((ObjectChange("removed", grid_of(ball())), ObjectChange("removed", grid_of(ball(BEYOND)))))
+    now = UpdatedField(before, gone, helper=BallWorld(()))
+    change = SceneChange((ObjectChange("added", grid_of(ball())),))
+    base, earlier = earlier_of(now, change, 1.5)
+    assert earlier.undone == (Origin(0, 0, 0),)
+    back = UpdatedField(base, change, earlier=earlier)
+    rays = views()
+    error = (render_rays(back, rays).rgb - render_rays(BallWorld((ball(),)), rays).rgb).abs()
+    assert float(error.mean()) < 0.01
+
+
+def test_a_newcomer_that_leaves_again():
+    before = BallWorld(())
+    came = SceneChange((ObjectChange("added", grid_of(ball())), ObjectChange("added", grid_of(ball(BEYOND)))))
+    now = UpdatedField(before, came, helper=BallWorld((ball(), ball(BEYOND))))
+    change = SceneChange((ObjectChange("removed", grid_of(ball())),))
+    base, earlier = earlier_of(now, change, 1.5)
+    left = UpdatedField(base, change, earlier=earlier)
+    rays = views()
+    error = (render_rays(left, rays).rgb - render_rays(BallWorld((ball(BEYOND),)), rays).rgb).abs()
+    assert float(error.mean()) < 0.01
+
+
+def test_what_never_moved_has_no_earlier():
+    before, now = first_visit()
+    change = SceneChange((ObjectChange("removed", grid_of(ball(BEYOND))),))
+    base, earlier = earlier_of(now, change, 1.5)
+    assert base is now and not earlier
+    assert not earlier_of(before, change, 1.5)[1]
+    with pytest.raises(ValueError, match="not had so many changes"):
+        without(now, Origin(0, 1, 0), departed=False)
+
+
+def test_an_edit_goes_through_later_layers():
+    _, now = first_visit()
+    other = SceneChange((ObjectChange("removed", grid_of(ball(BEYOND))),))
+    later = UpdatedField(now, other, helper=BallWorld(()))
+    change = SceneChange((next_move(BEYOND),))
+    _, earlier = earlier_of(later, change, 1.5)
+    assert earlier.left == (Origin(0, 1, 0),)
+    assert isinstance(earlier.ground, UpdatedField) and earlier.ground.change.objects == other.objects
+    inner = earlier.ground.pretrained
+    assert isinstance(inner, UpdatedField) and [o.kind for o in inner.change.objects] == ["removed"]
+
+
+def test_it_is_stored(tmp_path):
+    old = small_field(0)
+    there = SceneChange((moved(ball(), THERE), ObjectChange("removed", grid_of(ball(BEYOND)))))
+    now = UpdatedField(old, there, small_field(1))
+    for change in (SceneChange((next_move(at(0.6, 0.6, 0.3)),)), SceneChange((next_move(HERE),))):
+        base, earlier = earlier_of(now, change, 1.5)
+        assert earlier
+        field = UpdatedField(base, change, earlier=earlier)
+        save_updated(tmp_path, field)
+        back = load_updated(tmp_path, now, change)
+        assert replace(back.earlier, ground=None, places=earlier.places) == replace(earlier, ground=None)
+        x, d = torch.rand(3000, 3) * 2 - 1, torch.nn.functional.normalize(torch.randn(3000, 3), dim=-1)
+        for ours, theirs in zip(field(x, d), back(x, d)):
+            assert torch.equal(ours, theirs)
+        rays = Rays(torch.tensor([[0.0, 0.0, 3.0]]).expand(200, 3), torch.nn.functional.normalize(x[:200] - 3, dim=-1))
+        assert torch.equal(render_rays(field, rays).rgb, render_rays(back, rays).rgb)
