@@ -14,11 +14,11 @@ from torch import Tensor
 
 from refield.artefacts import TENSORS
 from refield.field.radiance import Field
-from refield.field.render import render_camera, render_many
+from refield.field.render import render_many
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change import OccupancyGrid
 from refield.scene.images import frame_image, write_image
-from refield.update.composite import UpdatedField
+from refield.update.composite import UpdatedField, leaving
 from refield.update.store import load_updated
 from refield.workspace import Workspace
 
@@ -63,9 +63,11 @@ def retouched(capture: Capture, before: Field, now: Field, folder: Path) -> Capt
     The photos are from ``before``; an update must not learn from them what an earlier visit has put right.
     Written as PNGs into ``folder``.
     """
-    frames = []
+    frames, changed = [], _changed_boxes(now)
+    if not changed:
+        return capture
     for i, frame in enumerate(capture.frames):
-        mask = _differs(frame, before, now)
+        mask = _differs(frame, before, now, changed)
         if not mask.any():
             frames.append(frame)
             continue
@@ -78,14 +80,29 @@ def retouched(capture: Capture, before: Field, now: Field, folder: Path) -> Capt
     return replace(capture, frames=tuple(frames))
 
 
-def _differs(frame: Frame, before: Field, now: Field) -> Tensor:
-    """(H, W) bool: where two states look different from a frame, with a margin of a coarse pixel."""
+def _differs(frame: Frame, before: Field, now: Field, changed: Sequence[Tensor]) -> Tensor:
+    """(H, W) bool: where two states look different from a frame, with a margin of a coarse pixel.
+
+    ``changed`` are world boxes (2, 3); only rays through them are compared.
+    """
     camera = frame.camera
     coarse = camera.scaled(max(camera.width // _COARSE, 1), max(camera.height // _COARSE, 1))
-    shown = [render_camera(f, coarse, frame.world_from_cam).rgb for f in (before, now)]
-    mask = ((shown[0] - shown[1]).abs().amax(-1) > _SHOWS).float()[None, None]
+    rays = camera_rays(coarse, frame.world_from_cam)
+    near = torch.stack([leaving(rays, box) for box in changed]).amax(0) > 0
+    mask = torch.zeros(1, 1, coarse.height, coarse.width)
+    shown = [render_many(f, rays[near]).rgb for f in (before, now)]
+    mask.view(-1)[near] = ((shown[0] - shown[1]).abs().amax(-1) > _SHOWS).float()
     mask = torch.nn.functional.max_pool2d(mask, 3, stride=1, padding=1)
     return torch.nn.functional.interpolate(mask, (camera.height, camera.width))[0, 0] > 0.5
+
+
+def _changed_boxes(now: Field) -> list[Tensor]:
+    """World boxes (2, 3) of everything that the visits that led to a field changed, light included."""
+    boxes: list[Tensor] = []
+    while isinstance(now, UpdatedField):
+        boxes += now.boxes + ((now.light.aabb,) if now.light is not None else ())
+        now = now.pretrained
+    return boxes
 
 
 def untouched_psnr(fields: Sequence[Field], frames: Sequence[Frame], masks: Sequence[Tensor]) -> list[float]:

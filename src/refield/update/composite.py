@@ -53,6 +53,8 @@ class Earlier:
     """these places, widely"""
     ground: Field | None = None
     """shows them without the objects"""
+    unknown: Region = NOWHERE
+    """parts of these places that even so nobody has seen: an object's old place and its new one overlapped"""
 
     def __bool__(self) -> bool:
         return bool(self.undone or self.left)
@@ -80,6 +82,7 @@ class UpdatedField:
         sampler: OccupancySampler | None = None,
         earlier: Earlier = NOTHING_EARLIER,
         skipped: frozenset[int] = frozenset(),
+        untaught: Region = NOWHERE,
     ) -> None:
         """What a visit adds to the old field.
 
@@ -89,7 +92,9 @@ class UpdatedField:
         along directions that none of them looked along. ``bare``, a part of the region, goes before what moved in.
         ``sampler`` is recomputed where things changed unless it is given. ``earlier`` says what earlier visits know;
         the change's objects that it names as undone, and those in ``skipped``, are as the old field shows them.
+        ``untaught`` is where something stood while the helper learnt: the old field knows better what is under it.
         """
+        self.untaught, self._was = untaught, carved(change, SKIN * pretrained.sampler.step)
         self.earlier, self.skipped = earlier, skipped | {origin.object for origin in earlier.undone}
         self.pretrained, self.change, self.helper, self.light = pretrained, change, helper, light
         self.shading, self.eyes, self.bare = shading, eyes, bare
@@ -98,6 +103,7 @@ class UpdatedField:
         if region is None:
             rest = self.to_learn
             region = carved(rest, SKIN * pretrained.sampler.step) if helper is None else move_out(rest, DILATION)
+            region = Region(region.grids + earlier.unknown.grids)
         self.region = region
         self.moves: tuple[Move, ...] = moves_of(_part(change, self.skipped))
         self._shells = tuple(Move(grown(m.grid, SKIN * pretrained.sampler.step), m.new_from_old) for m in self.moves)
@@ -190,6 +196,8 @@ class UpdatedField:
         mover = self.arrived(x[near])
         owner[near] = mover
         helped = (mover < 0) & self.region.contains(x[near])
+        if self.untaught.grids:
+            helped &= ~self.untaught.contains(x[near]) | self._was.contains(x[near])
         grounded = (mover < 0) & ~helped & self.earlier.places.contains(x[near])
         at, along = looked_up(x[near], d[near], mover, [m.old_from_new for m in self.moves])
         for i, outlook in enumerate(self._outlooks):

@@ -38,6 +38,7 @@ def recalled_pixels(cut: UpdatedField, frame: Frame) -> np.ndarray:
     known = [objects[p.object].grid for p in earlier.undone + earlier.left]
     known += [now for p in earlier.undone if (now := objects[p.object].grid_now) is not None]
     other = [m.grid.moved(m.new_from_old) for m in cut.moves] + [o.grid for o in cut.to_learn.objects]
+    other += earlier.unknown.grids
     return _silhouette(Region(tuple(known)), frame) & ~_silhouette(Region(tuple(other)), frame)
 
 

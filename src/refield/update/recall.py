@@ -17,10 +17,11 @@ from refield.field.warp import Move, inside_box, outline
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.pose import transform
 from refield.update.composite import Earlier, Origin, UpdatedField
-from refield.update.region import Region, move_out
+from refield.update.region import Region, carved, grown, move_out
 
 _SAME = 0.5  # of one grid's nodes that lie in the other
 _BACK = 0.06  # of an object's mean side: so near to its old place it may be back there; the photos decide
+_TAUGHT = 2.0  # samples around an object that stood there, within which a helper has not learnt much
 _NODES = 500  # asked of a grid
 
 
@@ -40,7 +41,22 @@ def earlier_of(field: Field, change: SceneChange, dilation: float) -> tuple[Fiel
         if brought is not None:
             left.append(Origin(k, *brought))
     places = move_out(replace(change, objects=tuple(change.objects[p.object] for p in left)), dilation)
-    return base, Earlier(tuple(undone), tuple(left), places, ground_of(base, tuple(left)))
+    ground = ground_of(base, tuple(left))
+    return base, Earlier(tuple(undone), tuple(left), places, ground, _unknown(ground))
+
+
+def _unknown(field: Field | None) -> Region:
+    """Where something stood while every helper learnt, at a place that the fitted field does not know either."""
+    grids: list[OccupancyGrid] = []
+    while isinstance(field, UpdatedField):
+        was = carved(field.change, _TAUGHT * field.pretrained.sampler.step)
+        for stood in field.untaught.grids:
+            x = stood.nodes()
+            both = stood.contains(x) & was.contains(x)
+            if both.any():
+                grids.append(OccupancyGrid(stood.aabb, both.float()))
+        field = field.pretrained
+    return Region(tuple(grids))
 
 
 def ground_of(field: Field, left: tuple[Origin, ...]) -> Field | None:
@@ -74,8 +90,13 @@ def without(field: Field, origin: Origin, *, departed: bool) -> Field:
     if departed and o.kind == "moved":
         gone = ObjectChange("removed", o.grid, masks=o.masks, confidence=o.confidence, note=o.note)
         objects = tuple(gone if k == own else q for k, q in enumerate(field.change.objects))
-        return _rebuilt(field, field.pretrained, change=replace(field.change, objects=objects), region=region,
-                        bare=kept, shading=shading)  # fmt: skip
+        change = replace(field.change, objects=objects)
+        assert o.new_from_old is not None  # it moved
+        stood = grown(o.grid.moved(o.new_from_old), _TAUGHT * field.pretrained.sampler.step)
+        untaught = Region((*field.untaught.grids, stood))
+        return _rebuilt(
+            field, field.pretrained, change=change, region=region, bare=kept, shading=shading, untaught=untaught
+        )
     skipped = field.skipped | {own}
     if len(skipped) == len(field.change.objects):
         return field.pretrained
@@ -100,6 +121,7 @@ def _rebuilt(field: UpdatedField, inner: Field, **changed: object) -> UpdatedFie
         "bare": field.bare,
         "earlier": field.earlier,
         "skipped": field.skipped,
+        "untaught": field.untaught,
     } | changed
     change = parts.pop("change")
     return UpdatedField(inner, change, field.helper, **parts)  # type: ignore[arg-type]

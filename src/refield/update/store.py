@@ -34,8 +34,9 @@ def save_updated(folder: Path, field: UpdatedField) -> None:
         "helper": None,
     }
     tensors |= _region_out("region", field.region) | _region_out("bare", field.bare)
-    tensors |= _region_out("places", field.earlier.places)
-    facts["places"] = len(field.earlier.places.grids)
+    for name, known in (("places", field.earlier.places), ("unknown", field.earlier.unknown)):
+        tensors |= _region_out(name, known)
+        facts[name] = len(known.grids)
     facts["undone"] = [[o.object, o.layer, o.index] for o in field.earlier.undone]
     facts["left"] = [[o.object, o.layer, o.index] for o in field.earlier.left]
     if field.eyes is not None:
@@ -91,8 +92,8 @@ def _earlier_in(tensors: dict[str, Tensor], facts: dict[str, Any], field: Field)
     undone, left = (tuple(Origin(*map(int, o)) for o in facts.get(name, ())) for name in ("undone", "left"))
     for origin in undone:
         field = without(field, origin, departed=False)
-    places = _region_in("places", facts.get("places", 0), tensors)
-    return field, Earlier(undone, left, places, ground_of(field, left))
+    places, unknown = (_region_in(name, facts.get(name, 0), tensors) for name in ("places", "unknown"))
+    return field, Earlier(undone, left, places, ground_of(field, left), unknown)
 
 
 def _region_out(name: str, region: Region) -> dict[str, Tensor]:

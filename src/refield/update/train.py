@@ -78,7 +78,8 @@ def update_field(
         bare=cut.bare,
         earlier=cut.earlier,
     )
-    wide = Region(move_out(cut.to_learn, config.dilation).grids + cut.bare.grids)
+    unknown = move_out(cut.to_learn, config.dilation).grids + cut.earlier.unknown.grids
+    wide = Region(unknown + cut.bare.grids)
     if not wide.grids:
         updated = lit(region=wide)
         updated.why_stopped = "earlier visits know all of it"
