@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -24,7 +25,7 @@ from refield.workspace import Workspace
 
 _SHOWS = 0.04
 """A rendered pixel that differs by more between two states shows what changed."""
-_COARSE = 2  # the comparison is made at half of the photos' size
+_COARSE, _LEAST = 4, 96  # the comparison is made at a quarter of the photos' size, but no fewer pixels across
 
 
 def changed_visits(workspace: Workspace, visit: int) -> list[int]:
@@ -60,24 +61,26 @@ def known_objects(now: Field) -> list[OccupancyGrid]:
 def retouched(capture: Capture, before: Field, now: Field, folder: Path) -> Capture:
     """The capture as if taken ``now``: where the photos show what has changed since, the field's own stand.
 
-    The photos are from ``before``; an update must not learn from them what an earlier visit has put right.
-    Written as PNGs into ``folder``.
+    The photos are from ``before``; an update must not learn from them what an earlier visit has put right. Each is
+    written as a PNG into ``folder`` when it is first looked at: few are, where every object is known.
     """
-    frames, changed = [], _changed_boxes(now)
+    changed = _changed_boxes(now)
     if not changed:
         return capture
-    for i, frame in enumerate(capture.frames):
-        mask = _differs(frame, before, now, changed)
-        if not mask.any():
-            frames.append(frame)
-            continue
-        image = frame_image(frame).float() / 255
+
+    def one(frame: Frame, name: str) -> Frame:
+        return replace(frame, path=folder / name, made=partial(_retouch, frame, (before, now), changed))
+
+    return replace(capture, frames=tuple(one(f, f"{i:04d}.png") for i, f in enumerate(capture.frames)))
+
+
+def _retouch(frame: Frame, states: tuple[Field, Field], changed: Sequence[Tensor], path: Path) -> None:
+    image = frame_image(frame).float() / 255
+    mask = _differs(frame, *states, changed)
+    if mask.any():
         rays = camera_rays(frame.camera, frame.world_from_cam)
-        image[mask] = render_many(now, rays[mask.reshape(-1)]).rgb
-        path = folder / f"{i:04d}.png"
-        write_image(path, image)
-        frames.append(replace(frame, path=path))
-    return replace(capture, frames=tuple(frames))
+        image[mask] = render_many(states[1], rays[mask.reshape(-1)]).rgb
+    write_image(path, image)
 
 
 def _differs(frame: Frame, before: Field, now: Field, changed: Sequence[Tensor]) -> Tensor:
@@ -86,7 +89,8 @@ def _differs(frame: Frame, before: Field, now: Field, changed: Sequence[Tensor])
     ``changed`` are world boxes (2, 3); only rays through them are compared.
     """
     camera = frame.camera
-    coarse = camera.scaled(max(camera.width // _COARSE, 1), max(camera.height // _COARSE, 1))
+    part = min(max(1 / _COARSE, _LEAST / min(camera.width, camera.height)), 1.0)
+    coarse = camera.scaled(max(round(camera.width * part), 1), max(round(camera.height * part), 1))
     rays = camera_rays(coarse, frame.world_from_cam)
     near = torch.stack([leaving(rays, box) for box in changed]).amax(0) > 0
     mask = torch.zeros(1, 1, coarse.height, coarse.width)

@@ -60,6 +60,29 @@ def test_a_move_that_is_taken_back_gives_the_old_pictures_back():
     assert torch.equal(render_rays(back, rays).rgb, render_rays(before, rays).rgb)
 
 
+def test_a_move_in_two_steps_is_taken_back_in_one():
+    before, now = first_visit()
+    on = SceneChange((next_move(BEYOND),))
+    base, earlier = earlier_of(now, on, 1.5)
+    twice = UpdatedField(base, on, earlier=earlier)
+    change = SceneChange((ObjectChange("moved", grid_of(ball(BEYOND)), HERE @ invert(BEYOND)),))
+    base, earlier = earlier_of(twice, change, 1.5)
+    assert base is before and earlier.undone == (Origin(0, 0, 0), Origin(0, 0, 0))
+
+
+def test_a_newcomer_that_was_moved_leaves_again():
+    before = BallWorld(())
+    came = SceneChange((ObjectChange("added", grid_of(ball())),))
+    now = UpdatedField(before, came, helper=BallWorld((ball(),)))
+    on = SceneChange((moved(ball(), THERE),))
+    base, earlier = earlier_of(now, on, 1.5)
+    assert earlier.left == (Origin(0, 0, 0),)
+    there = UpdatedField(base, on, earlier=earlier)
+    gone = SceneChange((ObjectChange("removed", grid_of(ball(THERE))),))
+    base, earlier = earlier_of(there, gone, 1.5)
+    assert base is before and len(earlier.undone) == 2
+
+
 def test_what_was_removed_and_is_put_back():
     before = BallWorld((ball(), ball(BEYOND)))
     gone = SceneChange((ObjectChange("removed", grid_of(ball())), ObjectChange("removed", grid_of(ball(BEYOND)))))

@@ -80,7 +80,7 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         clock.stage("load the field")
         number = workspace.visits
         old = state(workspace, number)
-        capture = _capture_now(workspace, number, old, clock, Path(scratch))
+        capture = _capture_now(workspace, number, old, Path(scratch))
         change = estimate_change(capture, old, frames, options.estimate, on_stage=clock.stage, known=known_objects(old))
         _need_a_photo(options.photos, change)
         new = _updated(capture, old, change, options.update, clock)
@@ -98,11 +98,10 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
     return Visit(workspace.visit(number + 1), change, evaluation)
 
 
-def _capture_now(workspace: Workspace, visit: int, now: Field, clock: Clock, scratch: Path) -> Capture:
+def _capture_now(workspace: Workspace, visit: int, now: Field, scratch: Path) -> Capture:
     capture = workspace.capture()
     if not changed_visits(workspace, visit):
         return capture
-    clock.stage("bring the old photos up to the last visit")
     return retouched(capture, workspace.field(), now, scratch)
 
 

@@ -6,7 +6,7 @@ photo cannot be used as a view by mistake. World units and axes are the capture'
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,6 +24,8 @@ class Photo:
     camera: Camera
     name: str
     """How the file calls it (the ``file_path`` of a transforms.json); unique within a capture."""
+    made: Callable[[Path], None] | None = field(default=None, kw_only=True, repr=False, compare=False)
+    """Writes the file when its pixels are first asked for; None for a file that is there."""
 
 
 @dataclass(frozen=True)

@@ -144,6 +144,8 @@ def frame_image(photo: Photo) -> Tensor:
     Raises:
         InputError: as `read_image`, or if the size is not the camera's.
     """
+    if photo.made is not None and not photo.path.exists():
+        photo.made(photo.path)
     image = read_image(photo.path)
     height, width = image.shape[:2]
     if (width, height) != (photo.camera.width, photo.camera.height):

@@ -30,12 +30,12 @@ def earlier_of(field: Field, change: SceneChange, dilation: float) -> tuple[Fiel
 
     Only proposed: whoever asks compares with the photos.
     """
-    base, undone, left = field, [], []
+    base = field
+    undone: list[Origin] = []
+    left: list[Origin] = []
     for k, o in enumerate(change.objects):
-        found = _taken_back(base, o)
-        if found is not None:
-            undone.append(Origin(k, *found))
-            base = without(base, undone[-1], departed=False)
+        steps, base = _taken_back(base, k, o)
+        undone += steps
     for k, o in enumerate(change.objects):
         brought = None if o.kind == "added" or k in {u.object for u in undone} else _brought(base, o.grid)
         if brought is not None:
@@ -139,21 +139,33 @@ def _brought(field: Field, place: OccupancyGrid) -> tuple[int, int] | None:
     return None
 
 
-def _taken_back(field: Field, o: ObjectChange) -> tuple[int, int] | None:
-    """The layer and index of an earlier object whose change this one takes back: it is where it was, or not at all."""
+def _taken_back(field: Field, k: int, o: ObjectChange) -> tuple[list[Origin], Field]:
+    """The earlier changes that object ``k`` takes back, since it is where it once was, or not at all; in the order in
+    which they are to be taken out, each counted on the field without those before it. And the field without them.
+    """
     if o.kind == "added":
-        return _removed_from(field, o.grid)
-    found = _brought(field, o.grid)
-    if found is None:
-        return None
-    q = _object(field, *found)
-    if o.new_from_old is None or q.new_from_old is None:
-        return found if o.kind == "removed" and q.kind == "added" else None
-    corners = torch.cartesian_prod(*outline(q.grid).T.double())
-    off = transform(o.new_from_old @ q.new_from_old, corners) - corners
-    box = q.grid.tight_aabb()
-    reach = max(_BACK * float((box[1] - box[0]).mean()), 2 * field.sampler.step)
-    return found if float(off.norm(dim=-1).max()) < reach else None
+        found = _removed_from(field, o.grid)
+        steps = [] if found is None else [Origin(k, *found)]
+        return steps, without(field, steps[0], departed=False) if steps else field
+    steps, base, at, total = [], field, o.grid, o.new_from_old
+    while (found := _brought(base, at)) is not None:
+        q = _object(base, *found)
+        steps.append(Origin(k, *found))
+        base = without(base, steps[-1], departed=False)
+        if q.new_from_old is None:
+            return (steps, base) if o.kind == "removed" else ([], field)
+        at, total = q.grid, None if total is None else total @ q.new_from_old
+        if total is not None and _near_identity(total, at, field.sampler.step):
+            return steps, base
+    return [], field
+
+
+def _near_identity(new_from_old: Tensor, grid: OccupancyGrid, step: float) -> bool:
+    """Whether a motion leaves an object about where it was."""
+    corners = torch.cartesian_prod(*outline(grid).T.double())
+    off = (transform(new_from_old, corners) - corners).norm(dim=-1)
+    box = grid.tight_aabb()
+    return float(off.max()) < max(_BACK * float((box[1] - box[0]).mean()), 2 * step)
 
 
 def _removed_from(field: Field, place: OccupancyGrid) -> tuple[int, int] | None:

@@ -40,7 +40,7 @@ class Lessons:
     def __len__(self) -> int:
         return len(self.rgb)
 
-    def __getitem__(self, chosen: Tensor) -> Lessons:
+    def __getitem__(self, chosen: Tensor | slice) -> Lessons:
         return Lessons(self.rays[chosen], self.rgb[chosen], self.photo[chosen])
 
 

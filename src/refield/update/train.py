@@ -86,7 +86,8 @@ def update_field(
         return updated
     say("supervise")
     region = _in_reach(wide.sampler(step_near(field, wide.box.mean(0))), capture.train + change.frames)
-    old = _old_lessons(capture, cut, region, config, light)
+    # what earlier visits know has been taken from them already; of the rest no old photo shows anything
+    old = _old_lessons(capture, cut, region, config, light) if cut.to_learn.objects else known.sparse[:0]
     sparse = known.sparse[meets(region, known.sparse.rays).nonzero()[:, 0]]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
