@@ -15,7 +15,7 @@ import torch
 from benchmarks.record import Report, Row, forget_peaks, median, one_line, peak_memory
 from refield.field import fit_nerfacto, gpu_fit, graphed
 from refield.field.coverage import knowable
-from refield.field.fit import FitConfig, FitProgress, _finest_for, place_contraction
+from refield.field.fit import FitConfig, FitProgress, Photos, _finest_for, place_contraction
 from refield.field.fit_nerfacto import NerfactoFitConfig
 from refield.field.gpu_fit import move
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
@@ -75,14 +75,15 @@ def noting_captures(device: torch.device) -> Iterator[Captures]:
 def fit(model: HashField, capture: Capture, config: FitConfig, device: torch.device, looks: list[FitProgress]) -> None:
     """`fit_on_gpu`; on a CPU the same loop by the same kernels."""
     if device.type == "cuda":
-        gpu_fit.fit_on_gpu(model, capture, config, looks.append)
+        gpu_fit.fit_on_gpu(model, Photos.of(capture), config, looks.append)
     else:
-        usual = gpu_fit._SIZES, gpu_fit._EVERY
-        gpu_fit._SIZES, gpu_fit._EVERY = [8], 4
+        usual = gpu_fit._SIZES, gpu_fit.EVERY
+        gpu_fit._SIZES, gpu_fit.EVERY = [8], 4
         try:
-            gpu_fit._GpuFit(model, capture, config, (knowable(model.sampler, capture.train), looks.append)).run()
+            extra = knowable(model.sampler, capture.train), looks.append, None
+            gpu_fit._GpuFit(model, Photos.of(capture), config, extra).run()
         finally:
-            gpu_fit._SIZES, gpu_fit._EVERY = usual
+            gpu_fit._SIZES, gpu_fit.EVERY = usual
 
 
 def one_fit(capture: Capture, config: FitConfig, device: torch.device) -> tuple[HashField, Row]:

@@ -173,7 +173,7 @@ def test_the_old_field_is_scored_on_the_same_pixels(tmp_path: Path) -> None:
 def test_without_masks_only_the_whole_is_scored(tmp_path: Path) -> None:
     scores = evaluate(Stripes(), dataset(tmp_path, Stripes(), masks=False)).pooled
     assert scores.psnr == 100.0
-    assert {k for k, v in asdict(scores).items() if v is not None} == {"psnr"}
+    assert {k for k, v in asdict(scores).items() if v is not None} == {"psnr", "ssim"}
 
 
 def test_the_report_survives_json(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -73,6 +73,16 @@ class FitProgress:
     seconds_left: float
 
 
+@dataclass(frozen=True)
+class Since:
+    """What is known of the scene since its capture was taken: for a fit to the scene as it is now."""
+
+    frames: tuple[Frame, ...] = ()
+    """photos taken since; all of their pixels teach, and none is held out"""
+    valid: Mapping[str, Tensor] = field(default_factory=dict)
+    """name of a frame of the capture -> (H, W) bool: its pixels that still show the scene; all, for those not named"""
+
+
 class NonFiniteError(RuntimeError):
     """The loss or its gradient stayed infinite or NaN for too long."""
 
@@ -83,45 +93,112 @@ class NonFiniteError(RuntimeError):
 
 
 ProgressCallback = Callable[[FitProgress], None]
+StepCallback = Callable[[int, HashField], None]
+"""Hears how many steps are done and the field as they left it, in training; it is not to change it."""
+UNCHANGED = Since()
 MOST_SKIPPED = 20  # steps in a row
 COARSEST = 1.5  # times the final step along the ray
 
 
 def fit_field(
-    capture: Capture, config: FitConfig = FitConfig(), on_progress: ProgressCallback | None = None
+    capture: Capture,
+    config: FitConfig = FitConfig(),
+    on_progress: ProgressCallback | None = None,
+    *,
+    since: Since = UNCHANGED,
+    start: HashField | None = None,
+    on_step: StepCallback | None = None,
 ) -> HashField:
     """Fit a field to the capture's training frames.
 
+    Args:
+        on_progress: called at each look at the held-out pixels.
+        since: newer photos to learn from as well, and pixels of the capture that are out of date.
+        start: a field whose weights are trained on, in its own shape and place; its occupancy is found anew. It is
+            not changed. By default the weights are random.
+        on_step: called after every step.
+
     Raises:
-        ValueError: no frame to train on.
+        ValueError: no frame, or no pixel, to train on.
         InputError: a GPU is wanted and there is none.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row; it holds the last good state.
     """
     torch.manual_seed(config.seed)
-    contraction = place_contraction(capture)
-    shape = config.field
-    if config.finest_auto:
-        shape = replace(shape, finest=_finest_for(capture.train, contraction, shape.log2_table))
-    step = 2 * contraction.radius * 4 / shape.finest  # about two pixels
-    grid = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.uint8)
-    model = HashField(shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), config.seed)
+    model = _new_field(capture, config) if start is None else _opened(start)
+    photos = Photos.of(capture, since)
     try:
         if config.device == "cuda":
-            _fit_on_gpu(model, capture, config, on_progress)
+            _fit_on_gpu(model, photos, config, on_progress, on_step)
         else:
-            _Fit(model, capture, config, on_progress).run()
+            _Fit(model, photos, config, on_progress, on_step).run()
     except NonFiniteError as error:
         error.field = model.eval().requires_grad_(False)
         raise
     return model.eval().requires_grad_(False)
 
 
-def _fit_on_gpu(model: HashField, capture: Capture, config: FitConfig, on_progress: ProgressCallback | None) -> None:
+@dataclass(frozen=True)
+class Photos:
+    """What a fit learns from, and what it is judged by."""
+
+    train: tuple[Frame, ...]
+    held_out: tuple[Frame, ...]
+    taught: tuple[Tensor | None, ...]
+    """per training frame, (H, W) bool: the pixels that teach; None: all"""
+    judged: tuple[Tensor | None, ...]
+    """the same of the held-out frames"""
+
+    @staticmethod
+    def of(capture: Capture, since: Since = UNCHANGED) -> Photos:
+        """Raises ValueError if there is nothing to learn from."""
+        train, held = capture.train + since.frames, capture.held_out
+        if not train:
+            raise ValueError("the capture has no frame to train on")
+        taught = *(since.valid.get(f.name) for f in capture.train), *(None for _ in since.frames)
+        if not any(mask is None or mask.any() for mask in taught):
+            raise ValueError("no pixel of the capture is left to train on")
+        return Photos(train, held, taught, tuple(since.valid.get(f.name) for f in held))
+
+    def bank(self, config: FitConfig) -> PixelBank:
+        """The pixels that teach."""
+        return PixelBank(self.train, most=most_pixels(config), masks=self.taught)
+
+    def judge(self) -> HeldOut:
+        """The pixels that do not."""
+        return HeldOut(self.held_out, masks=self.judged)
+
+
+def _new_field(capture: Capture, config: FitConfig) -> HashField:
+    """Random weights, in the shape and the place that suit the photos."""
+    contraction = place_contraction(capture)
+    shape = config.field
+    if config.finest_auto:
+        shape = replace(shape, finest=_finest_for(capture.train, contraction, shape.log2_table))
+    step = 2 * contraction.radius * 4 / shape.finest  # about two pixels
+    grid = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.uint8)
+    return HashField(shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), config.seed)
+
+
+def _opened(start: HashField) -> HashField:
+    """A copy of a field that looks everywhere, its weights free: things may have come to where nothing was."""
+    model = HashField.from_state(*start.state()).requires_grad_(True)
+    model.load_state_dict({k: v.clone() for k, v in model.state_dict().items()})
+    model.looking_where(torch.ones_like(model.sampler.grid))
+    return model
+
+
+def _fit_on_gpu(
+    model: HashField,
+    photos: Photos,
+    config: FitConfig,
+    on_progress: ProgressCallback | None,
+    on_step: StepCallback | None,
+) -> None:
     if not torch.cuda.is_available():
         raise InputError("device cuda", "torch finds no CUDA GPU on this machine", "leave the option out")
     from refield.field.gpu_fit import fit_on_gpu
 
-    fit_on_gpu(model, capture, config, on_progress)
+    fit_on_gpu(model, photos, config, on_progress, on_step)
 
 
 def place_contraction(capture: Capture) -> Contraction:
@@ -213,15 +290,17 @@ class _Fit:
     """The state of one run of :func:`fit_field`."""
 
     def __init__(
-        self, model: HashField, capture: Capture, config: FitConfig, on_progress: ProgressCallback | None
+        self,
+        model: HashField,
+        photos: Photos,
+        config: FitConfig,
+        on_progress: ProgressCallback | None,
+        on_step: StepCallback | None,
     ) -> None:
-        if not capture.train:
-            raise ValueError("the capture has no frame to train on")
-        self.model, self.config, self.on_progress = model, config, on_progress
-        self.pixels = PixelBank(capture.train, most=most_pixels(config))
-        self.judge = HeldOut(capture.held_out)
+        self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
+        self.pixels, self.judge = photos.bank(config), photos.judge()
         self.adam = TableAdam(model)
-        self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, capture.train))
+        self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
         self.samples_per_ray = config.samples / 512
@@ -249,6 +328,8 @@ class _Fit:
                 break
             self._step(step, progress)
             self.steps_done = step + 1
+            if self.on_step:
+                self.on_step(step + 1, self.model)
             if (step + 1) % self.config.check_every == 0:
                 looks.append(self._look(step + 1))
                 if at_plateau(looks, self.config):
@@ -327,10 +408,13 @@ def rate_factor(progress: float) -> float:
 class HeldOut:
     """Fixed pixels of photos that training never sees."""
 
-    def __init__(self, frames: tuple[Frame, ...], count: int = 16384) -> None:
+    def __init__(
+        self, frames: tuple[Frame, ...], count: int = 16384, masks: Sequence[Tensor | None] | None = None
+    ) -> None:
+        """``masks``: see `PixelBank`."""
         self.rays: Rays | None = None
-        if frames:
-            bank = PixelBank(frames, most=count)
+        bank = PixelBank(frames, most=count, masks=masks) if frames else ()
+        if isinstance(bank, PixelBank) and len(bank):
             chosen = torch.arange(len(bank))
             self.rays, self.truth = bank.rays(chosen), bank.colours(chosen)
 
