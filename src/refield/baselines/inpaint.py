@@ -87,14 +87,14 @@ class Lama:
 
 
 def inpaint(image: Tensor, mask: Tensor, painter: Inpainter | None = None, margin: int = 0) -> Tensor:
-    """A picture with the pixels of ``mask`` made up; the others stay as they are.
+    """A picture with the pixels of ``mask`` made up; those beyond its margin stay as they are.
 
     Args:
         image: (H, W, 3) in [0, 1].
         mask: (H, W) bool.
         painter: `Diffusion` by default.
-        margin: pixels around the mask that are not looked at either: in a render an object reaches a little beyond
-            its mask. They keep their own colours.
+        margin: pixels around the mask that are made up as well: in a render an object reaches a little beyond its
+            mask.
 
     Returns:
         (H, W, 3) float32.
@@ -106,7 +106,7 @@ def inpaint(image: Tensor, mask: Tensor, painter: Inpainter | None = None, margi
         return image.float()
     holes = dilate(mask.numpy(), margin)
     painted = (painter or Diffusion())(to_bytes(image.numpy()), holes)
-    return torch.where(mask[..., None], torch.from_numpy(painted).float() / 255, image.float())
+    return torch.where(torch.from_numpy(holes)[..., None], torch.from_numpy(painted).float() / 255, image.float())
 
 
 def _line(error: cv2.error) -> str:

@@ -182,7 +182,6 @@ def _new_field(capture: Capture, config: FitConfig) -> HashField:
 def _opened(start: HashField) -> HashField:
     """A copy of a field that looks everywhere, its weights free: things may have come to where nothing was."""
     model = HashField.from_state(*start.state()).requires_grad_(True)
-    model.load_state_dict({k: v.clone() for k, v in model.state_dict().items()})
     model.looking_where(torch.ones_like(model.sampler.grid))
     return model
 
