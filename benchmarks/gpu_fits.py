@@ -15,10 +15,11 @@ import torch
 from benchmarks.record import Report, Row, forget_peaks, median, one_line, peak_memory
 from refield.field import fit_nerfacto, gpu_fit, graphed
 from refield.field.coverage import knowable
-from refield.field.fit import FitConfig, FitProgress, Photos, _finest_for, place_contraction
+from refield.field.fit import FitConfig, FitProgress, _finest_for, place_contraction
 from refield.field.fit_nerfacto import NerfactoFitConfig
 from refield.field.gpu_fit import move
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
+from refield.field.photos import Photos
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import CHUNK, render_camera, render_many, visible_samples
 from refield.field.sampling import OccupancySampler

@@ -84,8 +84,11 @@ def worlds(bench: Bench, names: Sequence[str], seeds: int) -> list[Case]:
 
 
 def folders(bench: Bench, paths: Sequence[Path]) -> list[Case]:
-    """Raises InputError naming what a folder lacks."""
+    """Raises InputError naming what a folder lacks, or two of one name."""
+    names = [p.resolve().name for p in paths]
     for path in paths:
+        if names.count(path.resolve().name) > 1:
+            raise InputError(path, "another folder has the same name, which its results go by", "rename one")
         for part in ("work", "after", "eval"):
             if not (path / part).is_dir():
                 raise InputError(path / part, "there is no such folder", "give a folder with work/, after/ and eval/")

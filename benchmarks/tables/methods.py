@@ -185,6 +185,11 @@ def no_adjacent(lab: Lab, case: Case) -> Record:
     return _updated(lab, case, "no_adjacent", change_of(lab, case), replace(lab.update, dilation=1.0, far=0.0))
 
 
+def no_old(lab: Lab, case: Case) -> Record:
+    """The helper where it usually is, taught by the new photos alone."""
+    return _updated(lab, case, "no_old", change_of(lab, case), replace(lab.update, far=0.0))
+
+
 def no_refine(lab: Lab, case: Case) -> Record:
     """×PR: everything as before, from the initial poses (Fig. 9c)."""
     try:
@@ -292,7 +297,7 @@ def _painted(lab: Lab, case: Case, method: str, painter: Inpainter | None, from_
 METHODS: dict[str, Callable[[Lab, Case], Record]] = {
     f.__name__: f
     for f in (
-        estimate, estimate_unrefined, old, ours, no_adjacent, no_refine, top_views, usual_views_below, retrained,
+        estimate, estimate_unrefined, old, ours, no_adjacent, no_old, no_refine, top_views, usual_views_below, retrained,
         retrained_long, finetuned, inpainted, inpainted_photo, lama_photo,
     )
 }  # fmt: skip

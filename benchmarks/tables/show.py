@@ -68,8 +68,7 @@ def _printed(row: paper.Row | None, names: Sequence[str]) -> Row:
 
 
 def table_3(found: Found, how: str) -> str:
-    """The measures that need weights are left out where there are none, the paper's too."""
-    known = [n for n in paper.MEASURES if any(found.score(w, "ours", n, how) != "–" for w in found.worlds())]
+    """One row for each world and method."""
     rows: list[Row] = []
     for world in found.worlds():
         printed = paper.TABLE_3.get(world, {})
@@ -83,7 +82,7 @@ def table_3(found: Found, how: str) -> str:
             row["train s"] = spread(found.seconds(world, method, "train"), 1) if "inpaint" not in method else None
             row["total s"] = spread(_totals(found, world, method), 1)
             told = dict(zip((*paper.MEASURES, "minutes"), printed.get(theirs.get(method, ""), ())))
-            row |= {f"paper: {_title(n)}": told.get(n) for n in known}
+            row |= {f"paper: {_title(n)}": told.get(n) for n in paper.MEASURES}
             rows.append(row | {"paper: total min": told.get("minutes")})
     return markdown(_without_empty(rows))
 
@@ -101,9 +100,10 @@ def _totals(found: Found, world: str, method: str) -> list[float | None]:
 
 
 def _without_empty(rows: list[Row]) -> list[Row]:
-    """Without columns in which nothing is known."""
+    """Without columns in which nothing is known, and the paper's beside them."""
     columns = list(dict.fromkeys(k for row in rows for k in row))
     empty = {c for c in columns if all(row.get(c) in (None, "–") for row in rows)}
+    empty |= {f"paper: {c}" for c in empty}
     return [{k: row.get(k) for k in columns if k not in empty} for row in rows]
 
 
@@ -182,6 +182,7 @@ def table_5(found: Found, how: str) -> str:
             ("no_refine", "without pose refinement, in", IN, paper.TABLE_5_NO_REFINE.get(world)),
             ("ours", "full, out", OUT, full[3:6] if full else None),
             ("no_adjacent", "without adjacent areas, out", OUT, paper.TABLE_5_NO_ADJACENT.get(world)),
+            ("no_old", "helper as usual, but no old photos, out", OUT, None),
         ):
             short = [n.rpartition("_")[0] for n in names]
             row: Row = {"world": world, "": title}

@@ -18,13 +18,12 @@ from refield.field.fit import (
     FitConfig,
     FitProgress,
     NonFiniteError,
-    Photos,
-    Since,
     fit_field,
     place_contraction,
     rate_factor,
 )
 from refield.field.memory import memory_of
+from refield.field.photos import Photos, Since
 from refield.field.pixels import PixelBank
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_frame
@@ -226,7 +225,7 @@ def test_pixels_out_of_date_do_not_teach_and_newer_photos_do(capture: Capture) -
     valid = {f.name: torch.arange(32)[None].expand(32, 32) < 16 for f in capture.frames}
     valid[capture.train[0].name] = torch.zeros(32, 32, dtype=torch.bool)
     photos = Photos.of(capture, Since(capture.train[-2:], valid))
-    bank = photos.bank(TINY)
+    bank = photos.bank()
     whole = PixelBank(photos.train)
     assert len(bank) == 32 * 16 * (len(capture.train) - 1) + 2 * 1024
     assert int(bank.starts[1]) == 0  # nothing of the first

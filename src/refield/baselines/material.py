@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from refield.field.fit import Since
+from refield.field.photos import Since
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import SceneChange
 from refield.update.config import UpdateConfig

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -16,11 +16,10 @@ from refield.field.coverage import knowable
 from refield.field.encoding import Contraction, large_zeros
 from refield.field.kernels.reference import Aim, Batch
 from refield.field.occupancy import OccupancyTrainer
-from refield.field.pixels import PixelBank
+from refield.field.photos import UNCHANGED, Photos, Since
 from refield.field.radiance import HashField, HashFieldConfig
-from refield.field.render import render_many
 from refield.field.sampling import RESOLUTION, STOP, OccupancySampler
-from refield.scene.capture import Capture, Frame, Rays
+from refield.scene.capture import Capture, Frame
 from refield.scene.errors import InputError
 
 
@@ -73,16 +72,6 @@ class FitProgress:
     seconds_left: float
 
 
-@dataclass(frozen=True)
-class Since:
-    """What is known of the scene since its capture was taken: for a fit to the scene as it is now."""
-
-    frames: tuple[Frame, ...] = ()
-    """photos taken since; all of their pixels teach, and none is held out"""
-    valid: Mapping[str, Tensor] = field(default_factory=dict)
-    """name of a frame of the capture -> (H, W) bool: its pixels that still show the scene; all, for those not named"""
-
-
 class NonFiniteError(RuntimeError):
     """The loss or its gradient stayed infinite or NaN for too long."""
 
@@ -95,7 +84,6 @@ class NonFiniteError(RuntimeError):
 ProgressCallback = Callable[[FitProgress], None]
 StepCallback = Callable[[int, HashField], None]
 """Hears how many steps are done and the field as they left it, in training; it is not to change it."""
-UNCHANGED = Since()
 MOST_SKIPPED = 20  # steps in a row
 COARSEST = 1.5  # times the final step along the ray
 
@@ -125,7 +113,7 @@ def fit_field(
     """
     torch.manual_seed(config.seed)
     model = _new_field(capture, config) if start is None else _opened(start)
-    photos = Photos.of(capture, since)
+    photos = Photos.of(capture, since, most_pixels(config))
     try:
         if config.device == "cuda":
             _fit_on_gpu(model, photos, config, on_progress, on_step)
@@ -135,37 +123,6 @@ def fit_field(
         error.field = model.eval().requires_grad_(False)
         raise
     return model.eval().requires_grad_(False)
-
-
-@dataclass(frozen=True)
-class Photos:
-    """What a fit learns from, and what it is judged by."""
-
-    train: tuple[Frame, ...]
-    held_out: tuple[Frame, ...]
-    taught: tuple[Tensor | None, ...]
-    """per training frame, (H, W) bool: the pixels that teach; None: all"""
-    judged: tuple[Tensor | None, ...]
-    """the same of the held-out frames"""
-
-    @staticmethod
-    def of(capture: Capture, since: Since = UNCHANGED) -> Photos:
-        """Raises ValueError if there is nothing to learn from."""
-        train, held = capture.train + since.frames, capture.held_out
-        if not train:
-            raise ValueError("the capture has no frame to train on")
-        taught = *(since.valid.get(f.name) for f in capture.train), *(None for _ in since.frames)
-        if not any(mask is None or mask.any() for mask in taught):
-            raise ValueError("no pixel of the capture is left to train on")
-        return Photos(train, held, taught, tuple(since.valid.get(f.name) for f in held))
-
-    def bank(self, config: FitConfig) -> PixelBank:
-        """The pixels that teach."""
-        return PixelBank(self.train, most=most_pixels(config), masks=self.taught)
-
-    def judge(self) -> HeldOut:
-        """The pixels that do not."""
-        return HeldOut(self.held_out, masks=self.judged)
 
 
 def _new_field(capture: Capture, config: FitConfig) -> HashField:
@@ -297,7 +254,7 @@ class _Fit:
         on_step: StepCallback | None,
     ) -> None:
         self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
-        self.pixels, self.judge = photos.bank(config), photos.judge()
+        self.pixels, self.judge = photos.bank(), photos.judge()
         self.adam = TableAdam(model)
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
@@ -402,25 +359,3 @@ def rate_factor(progress: float) -> float:
     """Learning rate over the run: warm for the first half, then down to 1/30 along a cosine in the logarithm."""
     late = max(0.0, (progress - 0.5) / 0.5)
     return 30 ** -(0.5 - 0.5 * math.cos(math.pi * min(late, 1.0)))
-
-
-class HeldOut:
-    """Fixed pixels of photos that training never sees."""
-
-    def __init__(
-        self, frames: tuple[Frame, ...], count: int = 16384, masks: Sequence[Tensor | None] | None = None
-    ) -> None:
-        """``masks``: see `PixelBank`."""
-        self.rays: Rays | None = None
-        bank = PixelBank(frames, most=count, masks=masks) if frames else ()
-        if isinstance(bank, PixelBank) and len(bank):
-            chosen = torch.arange(len(bank))
-            self.rays, self.truth = bank.rays(chosen), bank.colours(chosen)
-
-    def psnr(self, model: HashField) -> float:
-        """dB over the pixels; NaN if there are none."""
-        if self.rays is None:
-            return math.nan
-        model.eval()
-        rgb = render_many(model, self.rays).rgb.clamp(0, 1)
-        return -10 * math.log10(max(float((rgb - self.truth).square().mean()), 1e-12))

@@ -15,7 +15,6 @@ from refield.field.fit import (
     FitConfig,
     FitProgress,
     NonFiniteError,
-    Photos,
     ProgressCallback,
     StepCallback,
     at_plateau,
@@ -25,6 +24,7 @@ from refield.field.fit import (
 from refield.field.graphed import Descent, DevicePixels, GraphedStep
 from refield.field.kernels.reference import Aim
 from refield.field.occupancy import DECAY, EVERY, OccupancyTrainer
+from refield.field.photos import Photos
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP
 from refield.scene.capture import Rays
@@ -81,7 +81,7 @@ class _GpuFit:
         self.model, self.config = model, config
         device = model.encoding.tables.device
         with torch.device("cpu"):  # photos are read and posed there
-            self.pixels = DevicePixels(photos.bank(config), device)
+            self.pixels = DevicePixels(photos.bank(), device)
             self.judge = photos.judge()
         if self.judge.rays is not None:
             r = self.judge.rays
