@@ -297,8 +297,8 @@ def _painted(lab: Lab, case: Case, method: str, painter: Inpainter | None, from_
 METHODS: dict[str, Callable[[Lab, Case], Record]] = {
     f.__name__: f
     for f in (
-        estimate, estimate_unrefined, old, ours, no_adjacent, no_old, no_refine, top_views, usual_views_below, retrained,
-        retrained_long, finetuned, inpainted, inpainted_photo, lama_photo,
+        estimate, estimate_unrefined, old, ours, no_adjacent, no_old, no_refine, top_views, usual_views_below,
+        retrained, retrained_long, finetuned, inpainted, inpainted_photo, lama_photo,
     )
 }  # fmt: skip
 METHODS |= {f"estimate_{n}_views": _estimate_views(n) for n in VIEWS}
