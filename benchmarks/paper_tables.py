@@ -95,15 +95,14 @@ def _run(options: argparse.Namespace) -> int:
     cases = [*synthetic, *folders(bench, options.folders)]
     lab = _lab(options)
     todo = [(c, m) for c, m in _plan(options, cases) if lab.kept.get(c.key, m) is None]
-    print(
-        f"{len(todo)} runs are missing" + "".join(f"\n  {c.key}: {m}" for c, m in todo if options.dry_run), flush=True
-    )
+    print(f"{len(todo)} runs are missing", flush=True)
     if options.dry_run:
+        print(*(f"  {c.key}: {m}" for c, m in todo), sep="\n")
         return 0
     failed = [line for c, m in todo if (line := _one(lab, c, m))]
     found = show.Found(lab.kept, cases)
     _publish(options.docs, found, failed)
-    print("\n".join(["", *failed, f"tables: {options.docs}"]))
+    print("", *failed, f"tables: {options.docs}", sep="\n")
     return 1 if failed else 0
 
 
