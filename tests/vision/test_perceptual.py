@@ -114,7 +114,8 @@ def test_torchvisions_own_file(tmp_path: Path) -> None:
     torch.save(network_of(model), tmp_path / "net")
     digest = hashlib.sha256((tmp_path / "net").read_bytes()).hexdigest()
     (tmp_path / "net").rename(tmp_path / f"alexnet-owt-{digest[:8]}.pth")
-    torch.save(channels_of(model), tmp_path / "alex.pth")
+    old_format = {"_use_new_zipfile_serialization": False}  # in which the authors published theirs
+    torch.save({k: nn.Parameter(v) for k, v in channels_of(model).items()}, tmp_path / "alex.pth", **old_format)
     assert open_lpips(tmp_path)(a, b) == model(a, b)
     next(tmp_path.glob("alexnet*")).rename(tmp_path / "alexnet-owt-00000000.pth")
     with pytest.raises(WeightsError, match="another checksum than its name says"):

@@ -124,7 +124,7 @@ def open_lpips(folder: Path, backbone: Backbone | None = None) -> Lpips:
         what = f"the weights of {wanted} do not fit ({_line(error)})"
         raise WeightsError(Path(folder), what, "get the file again") from None
     for lin, weight in zip(model.lins, channels[wanted]):
-        lin.copy_(weight)
+        lin.copy_(weight.detach())
     damaged = [k for k, v in model.state_dict().items() if not torch.isfinite(v).all()]
     if damaged or any(bool((lin < 0).any()) for lin in model.lins):
         what = f"{damaged[0]} is not finite" if damaged else "the weights of the channels are partly negative"
