@@ -186,8 +186,8 @@ def sixteen(bench: Bench, scene: Scene) -> list[Frame]:
 
 
 def spread(many: Sequence[Frame], count: int) -> Sequence[Frame]:
-    """So many of the photos, evenly spread as far as it goes."""
-    return many[:: len(many) // count][:count]
+    """So many of the photos, as evenly spread as it goes."""
+    return [many[k * len(many) // count] for k in range(count)]
 
 
 def kinds(bench: Bench) -> None:
