@@ -158,9 +158,9 @@ def views(bench: Bench) -> None:
     rows: list[Row] = []
     for name in ("cube", "cone"):
         scene = bench.scene(name)
-        many = _sixteen(bench, scene)
+        many = sixteen(bench, scene)
         for count in (1, 2, 3, 4, 8, 12, 16):
-            result, info = estimated(scene, many[:: len(many) // count][:count])
+            result, info = estimated(scene, spread(many, count))
             first = result.objects[0] if result is not None and result.objects else None
             rows.append(
                 {
@@ -177,11 +177,17 @@ def views(bench: Bench) -> None:
     bench.report("views", f"{bench.size}² pixels, one seed; the views are evenly spread on one circle", rows)
 
 
-def _sixteen(bench: Bench, scene: Scene) -> list[Frame]:
+def sixteen(bench: Bench, scene: Scene) -> list[Frame]:
+    """New photos from all round, at one height."""
     folder = scene.folder / "after16"
     if not (folder / "transforms.json").exists():
         shoot_state(scene.world.after, folder, (square_camera(bench.size), ring(scene.world.target, 16)))
     return load_new_photos(folder, scene.capture)
+
+
+def spread(many: Sequence[Frame], count: int) -> Sequence[Frame]:
+    """So many of the photos, as evenly spread as it goes."""
+    return [many[k * len(many) // count] for k in range(count)]
 
 
 def kinds(bench: Bench) -> None:

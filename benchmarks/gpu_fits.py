@@ -19,6 +19,7 @@ from refield.field.fit import FitConfig, FitProgress, _finest_for, place_contrac
 from refield.field.fit_nerfacto import NerfactoFitConfig
 from refield.field.gpu_fit import move
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
+from refield.field.photos import Photos
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import CHUNK, render_camera, render_many, visible_samples
 from refield.field.sampling import OccupancySampler
@@ -75,14 +76,15 @@ def noting_captures(device: torch.device) -> Iterator[Captures]:
 def fit(model: HashField, capture: Capture, config: FitConfig, device: torch.device, looks: list[FitProgress]) -> None:
     """`fit_on_gpu`; on a CPU the same loop by the same kernels."""
     if device.type == "cuda":
-        gpu_fit.fit_on_gpu(model, capture, config, looks.append)
+        gpu_fit.fit_on_gpu(model, Photos.of(capture), config, looks.append)
     else:
-        usual = gpu_fit._SIZES, gpu_fit._EVERY
-        gpu_fit._SIZES, gpu_fit._EVERY = [8], 4
+        usual = gpu_fit._SIZES, gpu_fit.EVERY
+        gpu_fit._SIZES, gpu_fit.EVERY = [8], 4
         try:
-            gpu_fit._GpuFit(model, capture, config, (knowable(model.sampler, capture.train), looks.append)).run()
+            extra = knowable(model.sampler, capture.train), looks.append, None
+            gpu_fit._GpuFit(model, Photos.of(capture), config, extra).run()
         finally:
-            gpu_fit._SIZES, gpu_fit._EVERY = usual
+            gpu_fit._SIZES, gpu_fit.EVERY = usual
 
 
 def one_fit(capture: Capture, config: FitConfig, device: torch.device) -> tuple[HashField, Row]:

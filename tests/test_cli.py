@@ -9,12 +9,14 @@ import time
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from refield.cli import COMMANDS, main
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
-from refield.scene.images import read_image
+from refield.scene.images import read_image, write_image
 from tests.conftest import HERE, TINY_FIT
 from tests.folders import contents
+from tests.vision.test_perceptual import channels_of, filled, network_of
 
 update = pytest.importorskip("refield.commands.update")
 
@@ -72,6 +74,21 @@ def test_evaluate_writes_numbers(place, capsys):
     assert main(["evaluate", "work", "new", "--out", "numbers.json"]) == 0
     assert json.loads((place / "numbers.json").read_text())["pooled"]["psnr"] > 0
     assert "psnr" in capsys.readouterr().out
+
+
+def test_evaluate_with_lpips(place, capsys):
+    """A mask of some pixels, and weights by chance: a number where there is a mask, none where there is none."""
+    model = filled("alex")
+    (place / "weights").mkdir()
+    save_file(network_of(model) | channels_of(model), str(place / "weights" / "both.safetensors"))
+    mask = torch.zeros(24, 32, dtype=torch.bool)
+    mask[4:14, 6:20] = True
+    for i in range(4):
+        write_image(place / "new" / "masks_in" / f"{i:03d}.png", mask)
+    assert main(["evaluate", "work", "new", "--lpips", "weights", "--out", "numbers.json"]) == 0
+    pooled = json.loads((place / "numbers.json").read_text())["pooled"]
+    assert pooled["lpips_in"] > 0 and pooled["lpips_out"] is None
+    assert "lpips-in" in capsys.readouterr().out
 
 
 def believing(monkeypatch, *kinds):

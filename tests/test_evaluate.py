@@ -12,7 +12,7 @@ import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from refield.evaluate import EvaluateConfig, Report, evaluate, pose_error
+from refield.evaluate import EvaluateConfig, Report, evaluate, pose_error, rescored
 from refield.field.encoding import Contraction
 from refield.field.render import render_frame
 from refield.field.sampling import OccupancySampler
@@ -173,7 +173,7 @@ def test_the_old_field_is_scored_on_the_same_pixels(tmp_path: Path) -> None:
 def test_without_masks_only_the_whole_is_scored(tmp_path: Path) -> None:
     scores = evaluate(Stripes(), dataset(tmp_path, Stripes(), masks=False)).pooled
     assert scores.psnr == 100.0
-    assert {k for k, v in asdict(scores).items() if v is not None} == {"psnr"}
+    assert {k for k, v in asdict(scores).items() if v is not None} == {"psnr", "ssim"}
 
 
 def test_the_report_survives_json(tmp_path: Path) -> None:
@@ -242,3 +242,38 @@ def test_pose_error_is_measured_at_the_object() -> None:
     turn = pose.exp(torch.tensor([0, 0, 0, 0, math.radians(2), 0], dtype=torch.float64))
     about = pose.rigid(turn[:3, :3], now - turn[:3, :3] @ now)
     assert pose_error(about @ true, true, centre) == pytest.approx((0, 2.0), abs=1e-6)
+
+
+def test_lpips_is_of_the_masks_boxes_and_left_out_without_weights(tmp_path: Path) -> None:
+    """With a stand-in that measures the mean difference: the boxes are those of SSIM."""
+
+    def mean_difference(image: Tensor, truth: Tensor) -> float:
+        assert image.shape == truth.shape == (64, 64, 3)
+        return float((image - truth).abs().mean())
+
+    folder = dataset(tmp_path, Stripes(), brighten_in=0.1)
+    config = EvaluateConfig(crop=64)
+    report = evaluate(Stripes(), folder, old=Stripes(0.5), config=config, perceptual=mean_difference)
+    assert [v.scores.lpips_in for v in report.views] == pytest.approx([0.1, 0.2], abs=0.01)
+    assert report.pooled.lpips_in == pytest.approx(0.15, abs=0.01) and report.pooled.lpips_out == 0
+    assert report.pooled_before is not None and (report.pooled_before.lpips_out or 0) > 0.1
+    assert evaluate(Stripes(), folder).pooled.lpips_in is None
+
+
+def test_other_pictures_of_the_same_views(tmp_path: Path) -> None:
+    report = evaluate(Stripes(), dataset(tmp_path, Stripes()), old=Stripes(0.5))
+    worse = [v.truth.clone() for v in report.views]
+    for picture in worse:
+        picture[BOX_OUT] += 0.1
+    other = rescored(report, worse)
+    assert other.pooled.psnr_in == 100.0 and other.pooled.psnr_out == pytest.approx(20.0, abs=0.2)
+    assert other.pooled_before is None and other.views[0].render_before is None
+    with pytest.raises(ValueError):
+        rescored(report, worse[:1])
+
+
+def test_ssim_of_whole_views(tmp_path: Path) -> None:
+    report = evaluate(Stripes(0.9), dataset(tmp_path, Stripes()))
+    each = [ssim(v.render, v.truth) for v in report.views]
+    assert [v.scores.ssim for v in report.views] == each
+    assert report.pooled.ssim == pytest.approx(sum(each) / len(each)) and report.pooled.ssim < 1

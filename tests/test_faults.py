@@ -173,6 +173,7 @@ ROWS: dict[str, tuple[list[str], Callable[[Path], object], str]] = {
     "a frame without a name": (RENDER, frame(0, "new", file_path="images/.."), r"no file name"),
     "pictures into a file": ([*RENDER[:-1], NEW], nothing, r"is a file, not a folder"),
     "nothing to evaluate": (["evaluate", "work", "nowhere"], nothing, r"nowhere"),
+    "no weights for LPIPS": (["evaluate", "work", "new", "--lpips", "nowhere"], nothing, r"nowhere: is not a folder"),
     "unknown command": (
         ["trian", "data", "out"],
         nothing,

@@ -19,6 +19,7 @@ MAY_IMPORT = {
     "update": {"scene", "field", "vision", "artefacts"},
     "evaluate": {"scene", "field", "vision"},
     "report": {"scene", "field", "vision"},
+    "baselines": {"scene", "field", "vision", "update"},  # learns from what the update's supervision leaves
     "history": {"scene", "field", "update", "workspace", "artefacts"},
     "cli": {"scene", "commands"},
     "commands": None,  # joins everything

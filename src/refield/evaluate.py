@@ -1,4 +1,4 @@
-"""How well does a field show what is there now? PSNR and SSIM, -in and -out (§11.2); pose error to truth.
+"""How well does a field show what is there now? PSNR, SSIM and LPIPS, -in and -out (§11.2); pose error to truth.
 
 Renders are rounded to 8 bits first, so the scores are those of the PNGs that ``refield render`` writes.
 Regions of a view: *in* and *out* are the pixels of its two change masks, *untouched* those far from both.
@@ -7,7 +7,7 @@ Regions of a view: *in* and *out* are the pixels of its two change masks, *untou
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,9 @@ from refield.scene.images import frame_image, read_mask
 from refield.scene.pose import angle_between, transform
 from refield.scene.transforms_json import load_transforms, stem
 from refield.vision.alignment import align
+from refield.vision.perceptual import Perceptual, lpips_in_box
 from refield.vision.pixels import dilate
-from refield.vision.similarity import pooled_psnr, squared_error, ssim_in_box
+from refield.vision.similarity import WINDOW, pooled_psnr, squared_error, ssim, ssim_in_box
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class EvaluateConfig:
     margin: int = 4
     """untouched pixels are those in neither mask dilated by so many pixels"""
     crop: int = 256
-    """side to which the masks' bounding boxes are resized for SSIM (§11.2)"""
+    """side to which the masks' bounding boxes are resized for SSIM and LPIPS (§11.2)"""
     align: bool = False
     """align each render to its photo by a homography first (§5.3): for photos whose poses are not exact"""
 
@@ -45,6 +46,8 @@ class Scores:
 
     psnr: float | None = None
     """of all pixels"""
+    ssim: float | None = None
+    """of whole views (§11.3.2)"""
     psnr_in: float | None = None
     ssim_in: float | None = None
     psnr_out: float | None = None
@@ -52,7 +55,7 @@ class Scores:
     psnr_untouched: float | None = None
     """of the pixels in neither mask, by `EvaluateConfig.margin`"""
     lpips_in: float | None = None
-    """not computed: it needs downloaded weights"""
+    """LPIPS needs weights; None without them"""
     lpips_out: float | None = None
 
 
@@ -80,7 +83,7 @@ class Report:
 
     views: tuple[ViewReport, ...]
     pooled: Scores
-    """PSNR over the pixels of all views together; SSIM as the mean over views"""
+    """PSNR over the pixels of all views together; SSIM and LPIPS as the mean over views"""
     mean: Scores
     """mean over the views that have a value"""
     pooled_before: Scores | None = None
@@ -110,12 +113,13 @@ def evaluate(
     old: Field | None = None,
     config: EvaluateConfig = EvaluateConfig(),
     on_view: Callable[[str], None] | None = None,
+    perceptual: Perceptual | None = None,
 ) -> Report:
     """Render every frame of ``folder/transforms.json`` and compare it with its image.
 
     ``folder`` also holds ``masks_in/`` and ``masks_out/``, PNGs with the images' stems. Either folder may be
     missing, and its scores are then None. ``old`` is scored on the same pixels; ``on_view`` hears each view's
-    name.
+    name; ``perceptual`` measures LPIPS.
 
     Raises:
         InputError: the folder cannot be read, or a mask is missing or of another size than its image.
@@ -125,14 +129,34 @@ def evaluate(
     for frame in load_transforms(folder).frames:
         if on_view is not None:
             on_view(frame.name)
-        views.append(_view(field, old, folder, frame, config))
+        views.append(_scored(_view(field, old, folder, frame, config), config, perceptual))
+    return _report(views, config)
+
+
+def rescored(
+    report: Report,
+    pictures: Sequence[Tensor],
+    config: EvaluateConfig = EvaluateConfig(),
+    perceptual: Perceptual | None = None,
+) -> Report:
+    """The same views as ``report`` shows, with other pictures in place of its renders, (H, W, 3) in [0, 1] each.
+
+    They are rounded as renders are, and not aligned.
+    """
+    views = [replace(v, render=_rounded(p), render_before=None) for v, p in zip(report.views, pictures, strict=True)]
+    return _report([_scored(v, config, perceptual) for v in views], config)
+
+
+def _report(views: Sequence[ViewReport], config: EvaluateConfig) -> Report:
+    mean = _mean([v.scores for v in views])
     before = [v.scores_before for v in views if v.scores_before is not None]
+    mean_before = _mean(before) if before else None
     return Report(
         views=tuple(views),
-        pooled=_pooled(views, False, config),
-        mean=_mean([v.scores for v in views]),
-        pooled_before=_pooled(views, True, config) if before else None,
-        mean_before=_mean(before) if before else None,
+        pooled=replace(mean, **_pooled(views, False, config)),
+        mean=mean,
+        pooled_before=None if mean_before is None else replace(mean_before, **_pooled(views, True, config)),
+        mean_before=mean_before,
     )
 
 
@@ -154,26 +178,38 @@ def pose_error(new_from_old: Tensor, true_new_from_old: Tensor, centre: Tensor) 
 def _view(new: Field, old: Field | None, folder: Path, frame: Frame, config: EvaluateConfig) -> ViewReport:
     truth = frame_image(frame).float() / 255
     mask_in, mask_out = (_mask(folder / name, frame) for name in ("masks_in", "masks_out"))
-    regions = _regions(mask_in, mask_out, config.margin, truth)
-    render = _rendered(new, frame, truth, config)
-    before = None if old is None else _rendered(old, frame, truth, config)
     return ViewReport(
         name=frame.name,
-        scores=_scores([_View(render, truth, regions)], config),
-        scores_before=None if before is None else _scores([_View(before, truth, regions)], config),
+        scores=Scores(),
+        scores_before=None,
         truth=truth,
-        render=render,
-        render_before=before,
+        render=_rendered(new, frame, truth, config),
+        render_before=None if old is None else _rendered(old, frame, truth, config),
         mask_in=mask_in,
         mask_out=mask_out,
     )
+
+
+def _scored(view: ViewReport, config: EvaluateConfig, perceptual: Perceptual | None) -> ViewReport:
+    """The view with the scores of its pictures."""
+    regions = _regions(view.mask_in, view.mask_out, config.margin, view.truth)
+
+    def of(image: Tensor) -> Scores:
+        return _scores(_View(image, view.truth, regions), config, perceptual)
+
+    before = None if view.render_before is None else of(view.render_before)
+    return replace(view, scores=of(view.render), scores_before=before)
 
 
 def _rendered(field: Field, frame: Frame, truth: Tensor, config: EvaluateConfig) -> Tensor:
     rgb = render_frame(field, frame).rgb.clamp(0, 1).cpu()
     if config.align:
         rgb = torch.from_numpy(align(rgb.numpy(), truth.numpy()))
-    return (rgb * 255).round() / 255
+    return _rounded(rgb)
+
+
+def _rounded(rgb: Tensor) -> Tensor:
+    return (rgb.clamp(0, 1) * 255).round() / 255
 
 
 def _mask(folder: Path, frame: Frame) -> Tensor | None:
@@ -212,34 +248,47 @@ class _View:
     regions: Mapping[str, Tensor]
 
 
-def _scores(views: Sequence[_View], config: EvaluateConfig) -> Scores:
-    """PSNR over the regions' pixels of all views together, SSIM as the mean over the views."""
-
-    def decibels(region: str) -> float | None:
-        known = [v for v in views if region in v.regions]
-        return pooled_psnr([squared_error(v.image, v.truth, v.regions[region]) for v in known])
+def _scores(view: _View, config: EvaluateConfig, perceptual: Perceptual | None) -> Scores:
+    """Of one view."""
 
     def similarity(region: str) -> float | None:
-        known = [v for v in views if region in v.regions]
-        return _average([ssim_in_box(v.image, v.truth, v.regions[region], config.crop) for v in known])
+        mask = view.regions.get(region)
+        return None if mask is None else ssim_in_box(view.image, view.truth, mask, config.crop)
 
+    def distance(region: str) -> float | None:
+        mask = view.regions.get(region)
+        if mask is None or perceptual is None:
+            return None
+        return lpips_in_box(perceptual, view.image, view.truth, mask, config.crop)
+
+    large = min(view.truth.shape[:2]) >= WINDOW
     return Scores(
-        psnr=decibels("all"),
-        psnr_in=decibels("in"),
+        **_decibels([view]),
+        ssim=ssim(view.image, view.truth) if large else None,
         ssim_in=similarity("in"),
-        psnr_out=decibels("out"),
         ssim_out=similarity("out"),
-        psnr_untouched=decibels("untouched"),
+        lpips_in=distance("in"),
+        lpips_out=distance("out"),
     )
 
 
-def _pooled(views: Sequence[ViewReport], before: bool, config: EvaluateConfig) -> Scores:
+def _decibels(views: Sequence[_View]) -> dict[str, float | None]:
+    """PSNR of each region, over its pixels in all the views together."""
+
+    def of(region: str) -> float | None:
+        known = [v for v in views if region in v.regions]
+        return pooled_psnr([squared_error(v.image, v.truth, v.regions[region]) for v in known])
+
+    return {"psnr": of("all")} | {f"psnr_{region}": of(region) for region in ("in", "out", "untouched")}
+
+
+def _pooled(views: Sequence[ViewReport], before: bool, config: EvaluateConfig) -> dict[str, float | None]:
     pictures = []
     for v in views:
         image = v.render_before if before else v.render
         assert image is not None  # asked for only where every view has one
         pictures.append(_View(image, v.truth, _regions(v.mask_in, v.mask_out, config.margin, v.truth)))
-    return _scores(pictures, config)
+    return _decibels(pictures)
 
 
 def _mean(scores: Sequence[Scores]) -> Scores:

@@ -23,6 +23,7 @@ from refield.field.fit import (
     rate_factor,
 )
 from refield.field.memory import memory_of
+from refield.field.photos import Photos, Since
 from refield.field.pixels import PixelBank
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_frame
@@ -204,8 +205,8 @@ def test_pixels_beyond_the_budget_are_drawn_from_every_photo(capture: Capture) -
     assert len(part) <= 5000 < len(whole) and part.starts.diff().min() > 80
     mine = torch.randint(len(part), (200,))
     owner = part.frame_of(mine)
-    assert part._places is not None
-    same = whole.starts[owner] + part._places[mine]
+    assert part.places is not None
+    same = whole.starts[owner] + part.places[mine]
     assert torch.equal(part.colours(mine), whole.colours(same))
     assert torch.equal(part.rays(mine).directions, whole.rays(same).directions)
 
@@ -217,3 +218,52 @@ def test_memory_is_known_before_it_is_taken(capture: Capture) -> None:
     assert held.photos == 7000 and len(PixelBank(capture.train, most=1000)) <= 1000
     assert "photos" in str(needed)
     fit_field(capture, replace(TINY, steps=20, photo_memory=7e-6))
+
+
+def test_pixels_out_of_date_do_not_teach_and_newer_photos_do(capture: Capture) -> None:
+    """Half of each old photo is painted over; the field never learns of it."""
+    valid = {f.name: torch.arange(32)[None].expand(32, 32) < 16 for f in capture.frames}
+    valid[capture.train[0].name] = torch.zeros(32, 32, dtype=torch.bool)
+    photos = Photos.of(capture, Since(capture.train[-2:], valid))
+    bank = photos.bank()
+    whole = PixelBank(photos.train)
+    assert len(bank) == 32 * 16 * (len(capture.train) - 1) + 2 * 1024
+    assert int(bank.starts[1]) == 0  # nothing of the first
+    chosen = torch.arange(0, len(bank), 37)
+    owner = bank.frame_of(chosen)
+    assert owner.min() == 1 and bank.places is not None
+    same = whole.starts[owner] + bank.places[chosen]
+    assert torch.equal(bank.colours(chosen), whole.colours(same))
+    assert torch.equal(bank.rays(chosen).directions, whole.rays(same).directions)
+    assert (bank.places[chosen] % 32 < 16)[owner < len(capture.train)].all()
+    judge = photos.judge()
+    assert judge.rays is not None and len(judge.rays) == 512 * len(capture.held_out)
+
+
+def test_masks_and_a_budget_together(capture: Capture) -> None:
+    half = torch.arange(32)[None].expand(32, 32) < 16
+    bank = PixelBank(capture.train, most=5000, masks=[half] * len(capture.train))
+    assert 4800 < len(bank) <= 5000 and bank.places is not None and (bank.places % 32 < 16).all()
+    with pytest.raises(ValueError, match="of its own size"):
+        PixelBank(capture.train, masks=[half[:5]] * len(capture.train))
+    with pytest.raises(ValueError, match="of its own size"):
+        PixelBank(capture.train, masks=[half])
+
+
+def test_nothing_left_to_learn_from_is_said(capture: Capture) -> None:
+    none = {f.name: torch.zeros(32, 32, dtype=torch.bool) for f in capture.frames}
+    with pytest.raises(ValueError, match="no pixel"):
+        fit_field(capture, TINY, since=Since(valid=none))
+
+
+def test_pixels_on_a_device_are_the_banks(capture: Capture) -> None:
+    pytest.importorskip("triton")
+    from refield.field.graphed import DevicePixels
+
+    half = torch.arange(32)[None].expand(32, 32) >= 16
+    bank = PixelBank(capture.train, masks=[half, *([None] * (len(capture.train) - 1))])
+    device = DevicePixels(bank, torch.device("cpu"))
+    chosen = torch.arange(0, len(bank), 31)
+    assert len(device) == len(bank)
+    torch.testing.assert_close(device.rays(chosen).directions, bank.rays(chosen).directions)
+    assert torch.equal(device.colours(chosen), bank.colours(chosen))

@@ -13,13 +13,16 @@ from refield.artefacts import writable
 from refield.commands.clock import Clock, results
 from refield.evaluate import EvaluateConfig, Report, Scores, evaluate
 from refield.history import state
+from refield.scene.errors import InputError
 from refield.scene.files import write_json
+from refield.vision.perceptual import Perceptual, open_lpips
+from refield.vision.weights import WeightsError
 from refield.workspace import Workspace
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Compare renderings with photos: PSNR and SSIM, inside the masks and on untouched pixels."""
+    """Compare renderings with photos: PSNR, SSIM and LPIPS, inside the masks and on untouched pixels."""
 
     work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace"""
@@ -29,10 +32,13 @@ class Evaluate:
     """the state to measure: 0 is before any visit; the latest by default, beside the state before any"""
     out: Path | None = None
     """a JSON file for the numbers"""
+    lpips: Path | None = None
+    """a folder with the weights of AlexNet or VGG16 and of LPIPS (docs/weights.md); without them LPIPS is left out"""
     config: EvaluateConfig = field(default_factory=EvaluateConfig)
 
 
 def run(options: Evaluate) -> None:
+    perceptual = _opened(options.lpips)
     clock = Clock()
     workspace = Workspace.open(options.work)
     visit = workspace.chosen_visit(options.visit)
@@ -40,12 +46,22 @@ def run(options: Evaluate) -> None:
     now = state(workspace, visit)
     before = state(workspace, 0) if visit else None
     clock.stage("evaluate")
-    report = evaluate(now, options.eval, old=before, config=options.config)
+    report = evaluate(now, options.eval, old=before, config=options.config, perceptual=perceptual)
     clock.stop()
     if options.out is not None:
         with writable(options.out):
             write_json(options.out, report.to_dict())
     results().print(table(report, f"visit {visit}"))
+
+
+def _opened(folder: Path | None) -> Perceptual | None:
+    """LPIPS, if there are weights for it. Raises InputError: they cannot be used."""
+    if folder is None:
+        return None
+    try:
+        return open_lpips(folder)
+    except WeightsError as error:
+        raise InputError(error.folder, error.what, error.remedy) from error
 
 
 def table(report: Report, name: str) -> Table:

@@ -16,11 +16,10 @@ from refield.field.coverage import knowable
 from refield.field.encoding import Contraction, large_zeros
 from refield.field.kernels.reference import Aim, Batch
 from refield.field.occupancy import OccupancyTrainer
-from refield.field.pixels import PixelBank
+from refield.field.photos import UNCHANGED, Photos, Since
 from refield.field.radiance import HashField, HashFieldConfig
-from refield.field.render import render_many
 from refield.field.sampling import RESOLUTION, STOP, OccupancySampler
-from refield.scene.capture import Capture, Frame, Rays
+from refield.scene.capture import Capture, Frame
 from refield.scene.errors import InputError
 
 
@@ -93,30 +92,46 @@ _TRIES, _FIRST_STEP, _SECOND_STEP = 3, 250, 500
 _BAD, _LEAST_DROP = 0.01, 0.8  # mean squared error of the colours; its ratio between the two
 
 ProgressCallback = Callable[[FitProgress], None]
+StepCallback = Callable[[int, HashField], None]
+"""Hears how many steps are done and the field as they left it, in training; it is not to change it."""
 MOST_SKIPPED = 20  # steps in a row
 COARSEST = 1.5  # times the final step along the ray
 
 
 def fit_field(
-    capture: Capture, config: FitConfig = FitConfig(), on_progress: ProgressCallback | None = None
+    capture: Capture,
+    config: FitConfig = FitConfig(),
+    on_progress: ProgressCallback | None = None,
+    *,
+    since: Since = UNCHANGED,
+    start: HashField | None = None,
+    on_step: StepCallback | None = None,
 ) -> HashField:
     """Fit a field to the capture's training frames.
 
+    Args:
+        on_progress: called at each look at the held-out pixels.
+        since: newer photos to learn from as well, and pixels of the capture that are out of date.
+        start: a field whose weights are trained on, in its own shape and place; its occupancy is found anew. It is
+            not changed. By default the weights are random.
+        on_step: called after every step.
+
     Raises:
-        ValueError: no frame to train on.
+        ValueError: no frame, or no pixel, to train on.
         InputError: a GPU is wanted and there is none.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row; it holds the last good state.
     """
-    began = time.perf_counter()
+    began, photos = time.perf_counter(), Photos.of(capture, since, most_pixels(config))
     for attempt in range(_TRIES):
         seed = config.seed + attempt
         torch.manual_seed(seed)
-        model = _fresh(capture, config, seed)
+        model = _new_field(capture, config, seed) if start is None else _opened(start)
         try:
             if config.device == "cuda":
-                _fit_on_gpu(model, capture, config, on_progress)
+                _fit_on_gpu(model, photos, config, on_progress, on_step)
             else:
-                _Fit(model, capture, config, on_progress, began).run(may_give_up=attempt < _TRIES - 1)
+                may_give_up = start is None and attempt < _TRIES - 1
+                _Fit(model, photos, config, on_progress, on_step, began=began).run(may_give_up)
             break
         except _StuckError:
             continue
@@ -126,7 +141,8 @@ def fit_field(
     return model.eval().requires_grad_(False)
 
 
-def _fresh(capture: Capture, config: FitConfig, seed: int) -> HashField:
+def _new_field(capture: Capture, config: FitConfig, seed: int) -> HashField:
+    """Random weights, in the shape and the place that suit the photos."""
     contraction = place_contraction(capture)
     shape = config.field
     if config.finest_auto:
@@ -136,12 +152,25 @@ def _fresh(capture: Capture, config: FitConfig, seed: int) -> HashField:
     return HashField(shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), seed)
 
 
-def _fit_on_gpu(model: HashField, capture: Capture, config: FitConfig, on_progress: ProgressCallback | None) -> None:
+def _opened(start: HashField) -> HashField:
+    """A copy of a field that looks everywhere, its weights free: things may have come to where nothing was."""
+    model = HashField.from_state(*start.state()).requires_grad_(True)
+    model.looking_where(torch.ones_like(model.sampler.grid))
+    return model
+
+
+def _fit_on_gpu(
+    model: HashField,
+    photos: Photos,
+    config: FitConfig,
+    on_progress: ProgressCallback | None,
+    on_step: StepCallback | None,
+) -> None:
     if not torch.cuda.is_available():
         raise InputError("device cuda", "torch finds no CUDA GPU on this machine", "leave the option out")
     from refield.field.gpu_fit import fit_on_gpu
 
-    fit_on_gpu(model, capture, config, on_progress)
+    fit_on_gpu(model, photos, config, on_progress, on_step)
 
 
 def place_contraction(capture: Capture) -> Contraction:
@@ -235,18 +264,16 @@ class _Fit:
     def __init__(
         self,
         model: HashField,
-        capture: Capture,
+        photos: Photos,
         config: FitConfig,
         on_progress: ProgressCallback | None,
+        on_step: StepCallback | None,
         began: float | None = None,
     ) -> None:
-        if not capture.train:
-            raise ValueError("the capture has no frame to train on")
-        self.model, self.config, self.on_progress = model, config, on_progress
-        self.pixels = PixelBank(capture.train, most=most_pixels(config))
-        self.judge = HeldOut(capture.held_out)
+        self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
+        self.pixels, self.judge = photos.bank(), photos.judge()
         self.adam = TableAdam(model)
-        self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, capture.train))
+        self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
         self.samples_per_ray = config.samples / 512
@@ -276,7 +303,9 @@ class _Fit:
                 break
             self._step(step, progress)
             self.steps_done = step + 1
-            if self._stuck() and may_give_up:
+            if self.on_step:
+                self.on_step(step + 1, self.model)
+            if may_give_up and self._stuck():
                 raise _StuckError
             if (step + 1) % self.config.check_every == 0:
                 looks.append(self._look(step + 1))
@@ -357,22 +386,3 @@ def rate_factor(progress: float) -> float:
     """Learning rate over the run: warm for the first half, then down to 1/30 along a cosine in the logarithm."""
     late = max(0.0, (progress - 0.5) / 0.5)
     return 30 ** -(0.5 - 0.5 * math.cos(math.pi * min(late, 1.0)))
-
-
-class HeldOut:
-    """Fixed pixels of photos that training never sees."""
-
-    def __init__(self, frames: tuple[Frame, ...], count: int = 16384) -> None:
-        self.rays: Rays | None = None
-        if frames:
-            bank = PixelBank(frames, most=count)
-            chosen = torch.arange(len(bank))
-            self.rays, self.truth = bank.rays(chosen), bank.colours(chosen)
-
-    def psnr(self, model: HashField) -> float:
-        """dB over the pixels; NaN if there are none."""
-        if self.rays is None:
-            return math.nan
-        model.eval()
-        rgb = render_many(model, self.rays).rgb.clamp(0, 1)
-        return -10 * math.log10(max(float((rgb - self.truth).square().mean()), 1e-12))

@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from refield.field import kernels
-from refield.field.fit import MOST_SKIPPED, FitProgress, HeldOut, NonFiniteError, ProgressCallback, place_contraction
+from refield.field.fit import MOST_SKIPPED, FitProgress, NonFiniteError, ProgressCallback, place_contraction
 from refield.field.interlevel import interlevel_loss
 from refield.field.losses import colour_loss, scale_gradients
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, looking_everywhere
+from refield.field.photos import HeldOut
 from refield.field.pixels import PixelBank
 from refield.field.proposal import Histogram, annealing
 from refield.field.volrend import Samples, accumulate_rgb, weights

@@ -14,21 +14,20 @@ from refield.field.fit import (
     MOST_SKIPPED,
     FitConfig,
     FitProgress,
-    HeldOut,
     NonFiniteError,
     ProgressCallback,
+    StepCallback,
     at_plateau,
-    most_pixels,
     progress_of,
     rate_factor,
 )
 from refield.field.graphed import Descent, DevicePixels, GraphedStep
 from refield.field.kernels.reference import Aim
 from refield.field.occupancy import DECAY, EVERY, OccupancyTrainer
-from refield.field.pixels import PixelBank
+from refield.field.photos import Photos
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP
-from refield.scene.capture import Capture, Rays
+from refield.scene.capture import Rays
 
 _BATCH = 32  # times the samples of a step on a CPU: fewer would leave most of the chip idle
 # two sizes an octave: a step's room for samples is at least half full, and few graphs are captured
@@ -37,21 +36,25 @@ _ROOM = 0.95  # of the samples' room is aimed at; what overflows is left out
 
 
 def fit_on_gpu(
-    model: HashField, capture: Capture, config: FitConfig, on_progress: ProgressCallback | None = None
+    model: HashField,
+    photos: Photos,
+    config: FitConfig,
+    on_progress: ProgressCallback | None = None,
+    on_step: StepCallback | None = None,
 ) -> None:
-    """Fit a field to the capture's training frames on the current CUDA device; the model comes back to where it was.
+    """Fit a field to photos on the current CUDA device; the model comes back to where it was.
 
-    As many steps as on a CPU, each of 32 times the samples.
+    As many steps as on a CPU, each of 32 times the samples. ``on_step`` hears every 16th.
 
     Raises:
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row.
     """
     home, device = model.encoding.tables.device, torch.device("cuda", torch.cuda.current_device())
-    allowed = knowable(model.sampler, capture.train)
+    allowed = knowable(model.sampler, photos.train)
     move(model, device)
     try:
         with torch.device(device):  # what is made in here without a device named is made on the GPU
-            _GpuFit(model, capture, config, (allowed.to(device), on_progress)).run()
+            _GpuFit(model, photos, config, (allowed.to(device), on_progress, on_step)).run()
     finally:
         move(model, home)
 
@@ -70,16 +73,16 @@ class _GpuFit:
     def __init__(
         self,
         model: HashField,
-        capture: Capture,
+        photos: Photos,
         config: FitConfig,
-        extra: tuple[torch.Tensor, ProgressCallback | None],
+        extra: tuple[torch.Tensor, ProgressCallback | None, StepCallback | None],
     ) -> None:
-        allowed, self.on_progress = extra
+        allowed, self.on_progress, self.on_step = extra
         self.model, self.config = model, config
         device = model.encoding.tables.device
         with torch.device("cpu"):  # photos are read and posed there
-            self.pixels = DevicePixels(PixelBank(capture.train, most=most_pixels(config)), device)
-            self.judge = HeldOut(capture.held_out)
+            self.pixels = DevicePixels(photos.bank(), device)
+            self.judge = photos.judge()
         if self.judge.rays is not None:
             r = self.judge.rays
             self.judge.rays = Rays(r.origins.to(device), r.directions.to(device))
@@ -111,6 +114,8 @@ class _GpuFit:
         while progress_of(self.config, step, self.began) < 1:
             step = self._round(graph, step)
             self.step, samples = step, int(graph.samples)
+            if self.on_step:
+                self.on_step(step, self.model)
             if int(self.descent.bad) >= MOST_SKIPPED:
                 raise NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
             if step >= due:

@@ -29,6 +29,7 @@ class DevicePixels:
         begins = torch.tensor([0, *(len(t) for t in tables)]).cumsum(0)
         self._count = len(bank)
         self._rgb, self._starts = bank.rgb.to(device), bank.starts.to(device)
+        self._places = None if bank.places is None else bank.places.to(device)
         self._directions = torch.cat(tables).to(device)  # of every pixel of every distinct camera, in camera axes
         self._begins = begins[[cameras.index(f.camera) for f in bank.frames]].to(device)
         self._rotations = torch.stack([f.world_from_cam[:3, :3] for f in bank.frames]).float().to(device)
@@ -40,7 +41,8 @@ class DevicePixels:
     def rays(self, pixels: Tensor) -> Rays:
         """World rays through pixel centres, (B,) -> Rays of B."""
         owner = torch.searchsorted(self._starts, pixels, right=True) - 1
-        d = self._directions[self._begins[owner] + pixels - self._starts[owner]]
+        local = pixels - self._starts[owner] if self._places is None else self._places[pixels]
+        d = self._directions[self._begins[owner] + local]
         return Rays(self._centres[owner], (self._rotations[owner] * d[:, None, :]).sum(-1))
 
     def colours(self, pixels: Tensor) -> Tensor:

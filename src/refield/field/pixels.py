@@ -18,20 +18,26 @@ class PixelBank:
     """P pixels of F photos in one row: colours uint8, rays made on demand."""
 
     def __init__(
-        self, frames: Sequence[Frame], images: Sequence[Tensor] | None = None, most: int | None = None
+        self,
+        frames: Sequence[Frame],
+        images: Sequence[Tensor] | None = None,
+        most: int | None = None,
+        masks: Sequence[Tensor | None] | None = None,
     ) -> None:
-        """Photos are read one by one. Of more than ``most`` pixels so many are kept, drawn from every photo alike."""
+        """Photos are read one by one.
+
+        ``masks``: per photo, (H, W) bool, the pixels that are kept; None keeps all of them. Of more than ``most``
+        pixels so many are kept, drawn from every photo alike.
+        """
         if not frames:
             raise ValueError("a pixel bank needs at least one frame")
         self.frames = tuple(frames)
+        parts = _kept(frames, most, [None] * len(frames) if masks is None else masks)
         counts = torch.tensor([f.camera.width * f.camera.height for f in frames])
-        self._places: Tensor | None = None
-        parts = None
-        if most is not None and int(counts.sum()) > most:
-            g = torch.Generator().manual_seed(0)
-            share = most / int(counts.sum())
-            parts = [torch.randperm(int(n), generator=g)[: max(int(n * share), 1)].sort().values for n in counts]
-            self._places = torch.cat([p.int() for p in parts])
+        self.places: Tensor | None = None
+        """(P,) int32: each pixel's place in its photo, row by row; None where every pixel is kept"""
+        if parts is not None:
+            self.places = torch.cat([p.int() for p in parts])
             counts = torch.tensor([len(p) for p in parts])
         self.starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
         """(F + 1,) int64: frame i owns pixels ``starts[i] : starts[i + 1]``, row by row"""
@@ -58,7 +64,7 @@ class PixelBank:
     def rays(self, pixels: Tensor) -> Rays:
         """World rays through pixel centres, (B,) -> Rays of B."""
         owner = self.frame_of(pixels)
-        local = pixels - self.starts[owner] if self._places is None else self._places[pixels].long()
+        local = pixels - self.starts[owner] if self.places is None else self.places[pixels].long()
         d = torch.empty(len(pixels), 3)
         for k, camera in enumerate(self._cameras):
             mine = slice(None) if len(self._cameras) == 1 else (self._camera_of[owner] == k).nonzero()[:, 0]
@@ -77,3 +83,28 @@ class PixelBank:
         if camera not in self._tables:
             self._tables[camera] = camera.unproject(camera.pixel_centres()).float()
         return self._tables[camera][local]
+
+
+def _kept(frames: Sequence[Frame], most: int | None, masks: Sequence[Tensor | None]) -> list[Tensor] | None:
+    """Places of the pixels that are kept, int64 for each photo; None if that is all of them.
+
+    Raises ValueError if the masks are not the photos' in number and size.
+    """
+    sizes = [(f.camera.height, f.camera.width) for f in frames]
+    if len(masks) != len(frames) or any(m is not None and tuple(m.shape) != s for m, s in zip(masks, sizes)):
+        raise ValueError("each photo has one mask, of its own size, or None")
+    counts = [h * w if m is None else int(m.sum()) for m, (h, w) in zip(masks, sizes)]
+    share = 1.0 if most is None else most / max(sum(counts), 1)
+    if share >= 1 and all(m is None for m in masks):
+        return None
+    g = torch.Generator().manual_seed(0)
+    parts = []
+    for mask, n in zip(masks, counts):
+        chosen = torch.arange(n) if share >= 1 or not n else _some(n, max(int(n * share), 1), g)
+        parts.append(chosen if mask is None else mask.reshape(-1).nonzero()[:, 0][chosen])
+    return parts
+
+
+def _some(count: int, wanted: int, g: torch.Generator) -> Tensor:
+    """``wanted`` of ``count`` indices, in order."""
+    return torch.randperm(count, generator=g)[:wanted].sort().values

@@ -16,7 +16,8 @@ HEIGHTS = 10
 FIELD_OF_VIEW = 46.0
 """degrees; 1.8 m across at the distance of the middle"""
 _LOWEST, _HIGHEST = 0.2, 0.94  # sine of the elevation
-_NEW_ELEVATION = math.radians(36)
+NEW_ELEVATION = 36.0
+"""degrees, of the new photos"""
 
 
 def square_camera(size: int) -> Camera:
@@ -56,7 +57,10 @@ def hemisphere(count: int, target: tuple[float, float, float]) -> list[Tensor]:
     return poses
 
 
-def ring(target: tuple[float, float, float], count: int = 8) -> list[Tensor]:
-    """The new views: ``count`` poses at one height, 360 / count degrees apart."""
+def ring(
+    target: tuple[float, float, float], count: int = 8, elevation: float = NEW_ELEVATION, turn: float = 0.0
+) -> list[Tensor]:
+    """The new views: ``count`` poses at one ``elevation`` (degrees), 360 / count degrees apart, turned by ``turn``."""
     middle = torch.tensor(target, dtype=torch.float64)
-    return [_on_sphere(middle, _NEW_ELEVATION, 2 * math.pi * (k + 0.3) / count) for k in range(count)]
+    angle, first = math.radians(elevation), math.radians(turn)
+    return [_on_sphere(middle, angle, first + 2 * math.pi * (k + 0.3) / count) for k in range(count)]

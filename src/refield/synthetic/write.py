@@ -89,7 +89,7 @@ def photograph(world: World, out: Path, config: SynthConfig, on_progress: Progre
     after = shoot("after", world.after, new[0::2])
     evaluation = shoot("eval", world.after, new[1::2])
     for folder, capture in (("after", after), ("eval", evaluation)):
-        _write_masks(world, out / folder, capture)
+        write_masks(world, out / folder, capture)
     (out / "truth").mkdir(exist_ok=True)
     save_change(out / "truth", true_change(world, before, after.frames))
 
@@ -156,7 +156,8 @@ def _object_change(world: World, change: TrueChange, frames: Sequence[Frame]) ->
     )
 
 
-def _write_masks(world: World, folder: Path, capture: Capture) -> None:
+def write_masks(world: World, folder: Path, capture: Capture) -> None:
+    """The true masks and depths of photos of the new state: ``masks_in/``, ``masks_out/`` and ``depth/``."""
     for kind in ("masks_in", "masks_out", "depth"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     for frame in capture.frames:

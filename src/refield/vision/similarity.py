@@ -16,7 +16,7 @@ from refield.vision.pixels import bounding_box
 
 MAX_PSNR = 100.0
 """Equal pictures have no finite PSNR, and JSON has no infinity."""
-_WINDOW, _SIGMA = 11, 1.5  # of SSIM's Gaussian (Wang et al. 2004)
+WINDOW, _SIGMA = 11, 1.5  # of SSIM's Gaussian (Wang et al. 2004)
 
 
 def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float | None:
@@ -59,17 +59,23 @@ def ssim_in_box(image: Tensor, truth: Tensor, mask: Tensor, side: int = 256) -> 
 
     Pixels in the box that are outside the mask stay as they are. None if the mask has no pixel.
     """
+    pair = boxed(image, truth, mask, side)
+    return None if pair is None else ssim(*pair)
+
+
+def boxed(image: Tensor, truth: Tensor, mask: Tensor, side: int) -> tuple[Tensor, Tensor] | None:
+    """Both pictures in the tight bounding box of ``mask`` (H, W) bool, resized to (side, side, 3); None without one."""
     corners = bounding_box(mask.numpy())
     if corners is None:
         return None
     x0, y0, x1, y1 = corners
     box = (slice(y0, y1), slice(x0, x1))
-    return ssim(_resized(image[box], side), _resized(truth[box], side))
+    return _resized(image[box], side), _resized(truth[box], side)
 
 
 def _blur(x: Tensor) -> Tensor:
     """(C, 1, H, W) -> the Gaussian mean wherever the whole window fits."""
-    t = torch.arange(_WINDOW, dtype=x.dtype) - _WINDOW // 2
+    t = torch.arange(WINDOW, dtype=x.dtype) - WINDOW // 2
     g = torch.exp(-t.square() / (2 * _SIGMA**2))
     g = g / g.sum()
     return functional.conv2d(functional.conv2d(x, g.view(1, 1, -1, 1)), g.view(1, 1, 1, -1))

@@ -1,0 +1,164 @@
+"""Figs. 8, 15, 17 and 18: the sheet of renders, and curves."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from refield.report.pictures import IN_COLOUR, OUT_COLOUR
+from refield.scene.files import write_bytes
+from refield.scene.images import frame_image, read_image, read_mask
+from refield.scene.transforms_json import load_transforms
+from refield.vision.pixels import bounding_box
+from tables.cases import Case
+from tables.kept import Kept
+from tables.methods import LONGER, VIEWS
+from tables.show import Found
+
+COLUMNS = {
+    "old": "before",
+    "truth": "truth",
+    "ours": "ours",
+    "retrained": "re-trained",
+    "finetuned": "fine-tuned",
+    "inpainted": "in-painted",
+    "lama_photo": "LaMa",
+}
+_INKS = {"ours": "#0f766e", "retrained": "#b45309", "retrained_long": "#d97706", "finetuned": "#7c3aed"}
+_LABELS = {"retrained_long": f"re-trained, {LONGER} times the steps"}
+_GAP, _CAPTION, _SIDE = 6, 20, 190
+
+
+def sheet(kept: Kept, cases: Sequence[Case], path: Path) -> bool:
+    """New photo · before · truth · ours · baselines, a row for each case; whether there was anything to draw."""
+    rows = [row for c in cases if (row := _row(kept, c)) is not None]
+    if not rows:
+        return False
+    columns = [c for c in ("new photo", *COLUMNS.values()) if any(c in row for row in rows)]
+    height = _CAPTION + len(rows) * (_SIDE + _GAP)
+    out = Image.new("RGB", (len(columns) * (_SIDE + _GAP) + _GAP, height), "white")
+    draw, font = ImageDraw.Draw(out), ImageFont.load_default(13)
+    for i, column in enumerate(columns):
+        x = _GAP + i * (_SIDE + _GAP)
+        draw.text((x, _CAPTION / 2), column, fill=(60, 60, 67), font=font, anchor="lm")
+        for j, row in enumerate(rows):
+            if column in row:
+                out.paste(row[column], (x, _CAPTION + j * (_SIDE + _GAP)))
+    _write(path, out)
+    return True
+
+
+def _row(kept: Kept, case: Case) -> dict[str, Image.Image] | None:
+    if kept.get(case.key, "ours") is None:
+        return None
+    frames = load_transforms(case.evaluation).frames
+    masks = {i: _masks(case.evaluation, f.path.name) for i, f in enumerate(frames)}
+    best = max(masks, key=lambda i: min((int(m.sum()) for m in masks[i].values()), default=0))
+    row = {"new photo": _tile(frame_image(case.frames[0]).float() / 255, {})}
+    for method, title in COLUMNS.items():
+        source = kept.pictures(case.key, method) / f"{best:04d}.png"
+        if method == "truth":
+            row[title] = _tile(frame_image(frames[best]).float() / 255, masks[best])
+        elif source.is_file():
+            row[title] = _tile(read_image(source).float() / 255, masks[best])
+    return row
+
+
+def _masks(folder: Path, name: str) -> dict[str, Tensor]:
+    paths = {kind: folder / f"masks_{kind}" / f"{Path(name).stem}.png" for kind in ("in", "out")}
+    return {kind: read_mask(p) for kind, p in paths.items() if p.is_file()}
+
+
+def _tile(image: Tensor, masks: dict[str, Tensor]) -> Image.Image:
+    """The picture at the sheet's size, with a box around where something arrived and left (Fig. 8)."""
+    pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    h, w = image.shape[:2]
+    tile = Image.fromarray(pixels).resize((_SIDE, round(_SIDE * h / w)), Image.Resampling.BICUBIC)
+    draw = ImageDraw.Draw(tile)
+    for kind, ink in (("in", IN_COLOUR), ("out", OUT_COLOUR)):
+        box = bounding_box(masks[kind].numpy(), margin=2) if kind in masks else None
+        if box is not None:
+            draw.rectangle([v * _SIDE / w for v in box], outline=ink, width=2)
+    return tile.crop((0, 0, _SIDE, _SIDE))
+
+
+def _write(path: Path, image: Image.Image) -> None:
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", optimize=True)
+    write_bytes(path, buffer.getvalue())
+
+
+# --- curves ---
+
+
+def convergence(found: Found, world: str, path: Path) -> bool:
+    """Fig. 15: whole-view SSIM and PSNR, PSNR-out and PSNR-in over seconds of training."""
+    panels = {"ssim": "SSIM, whole views", "psnr": "PSNR, whole views, dB", "psnr_out": "PSNR-out, dB"}
+    panels["psnr_in"] = "PSNR-in, dB"
+    runs = [(m, r["curve"]) for m in _INKS for r in found.of(world, m) if len(r.get("curve", [])) > 1]
+    if not runs:
+        return False
+    figure, axes = _figure(len(panels))
+    for axis, (name, title) in zip(axes, panels.items()):
+        for method, curve in runs:
+            known = [(p["seconds"], p["scores"][name]) for p in curve if p["scores"].get(name) is not None]
+            if known:
+                axis.plot(*zip(*known), color=_INKS[method], marker=".", lw=1.2)
+        axis.set(xscale="log", xlabel="seconds of training", title=title)
+        axis.grid(alpha=0.25, which="both", lw=0.5)
+    for method in dict.fromkeys(m for m, _ in runs):
+        axes[0].plot([], [], color=_INKS[method], label=_LABELS.get(method) or COLUMNS[method])
+    axes[0].legend(frameon=False, loc="lower right", fontsize=8)
+    _save(figure, path)
+    return True
+
+
+def number_of_views(found: Found, path: Path) -> bool:
+    """Figs. 17 and 18: quality where something left, over the number of new photos."""
+    panels = {"psnr_out": "PSNR-out, dB", "ssim_out": "SSIM-out", "lpips_out": "LPIPS-out"}
+    points: dict[tuple[str, str], list[tuple[int, float]]] = {}
+    for world in found.worlds():
+        for name in panels:
+            for count in VIEWS:
+                each = [r["scores"]["as rendered"].get(name) for r in found.of(world, f"true_{count}_views")]
+                known = [v for v in each if v is not None]
+                if known:
+                    points.setdefault((name, world), []).append((count, sum(known) / len(known)))
+    shown = [n for n in panels if any(key[0] == n for key in points)]
+    if not shown:
+        return False
+    figure, axes = _figure(len(shown))
+    for axis, name in zip(axes, shown):
+        for (measure, world), line in points.items():
+            if measure == name:
+                axis.plot(*zip(*line), marker="o", ms=3, lw=1.2, label=world)
+        axis.set(xlabel="new photos", title=panels[name], xticks=VIEWS)
+        axis.grid(alpha=0.25, lw=0.5)
+    axes[0].legend(frameon=False)
+    _save(figure, path)
+    return True
+
+
+def _figure(panels: int) -> tuple[Any, Any]:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, panels, figsize=(3.6 * panels, 3.0), layout="constrained", squeeze=False)
+    return figure, axes[0]
+
+
+def _save(figure: Any, path: Path) -> None:
+    from matplotlib import pyplot
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    pyplot.close(figure)
+    write_bytes(path, buffer.getvalue())

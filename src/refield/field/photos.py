@@ -1,0 +1,85 @@
+"""What a fit learns from and is judged by: a capture's photos, and what has become known of the scene since."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from refield.field.pixels import PixelBank
+from refield.field.radiance import HashField
+from refield.field.render import render_many
+from refield.scene.capture import Capture, Frame, Rays
+
+
+@dataclass(frozen=True)
+class Since:
+    """What is known of the scene since its capture was taken: for a fit to the scene as it is now."""
+
+    frames: tuple[Frame, ...] = ()
+    """photos taken since; all of their pixels teach, and none is held out"""
+    valid: Mapping[str, Tensor] = field(default_factory=dict)
+    """name of a frame of the capture -> (H, W) bool: its pixels that still show the scene; all, for those not named"""
+
+
+UNCHANGED = Since()
+
+
+@dataclass(frozen=True)
+class Photos:
+    """What a fit learns from, and what it is judged by."""
+
+    train: tuple[Frame, ...]
+    held_out: tuple[Frame, ...]
+    taught: tuple[Tensor | None, ...]
+    """per training frame, (H, W) bool: the pixels that teach; None: all"""
+    judged: tuple[Tensor | None, ...]
+    """the same of the held-out frames"""
+    most: int | None = None
+    """of more pixels so many are kept, drawn from every photo alike"""
+
+    @staticmethod
+    def of(capture: Capture, since: Since = UNCHANGED, most: int | None = None) -> Photos:
+        """Raises ValueError if there is nothing to learn from."""
+        train, held = capture.train + since.frames, capture.held_out
+        if not train:
+            raise ValueError("the capture has no frame to train on")
+        taught = *(since.valid.get(f.name) for f in capture.train), *(None for _ in since.frames)
+        if not any(mask is None or mask.any() for mask in taught):
+            raise ValueError("no pixel of the capture is left to train on")
+        return Photos(train, held, taught, tuple(since.valid.get(f.name) for f in held), most)
+
+    def bank(self) -> PixelBank:
+        """The pixels that teach."""
+        return PixelBank(self.train, most=self.most, masks=self.taught)
+
+    def judge(self) -> HeldOut:
+        """The pixels that do not."""
+        return HeldOut(self.held_out, masks=self.judged)
+
+
+class HeldOut:
+    """Fixed pixels of photos that training never sees."""
+
+    def __init__(
+        self, frames: tuple[Frame, ...], count: int = 16384, masks: Sequence[Tensor | None] | None = None
+    ) -> None:
+        """``masks``: see `PixelBank`."""
+        self.rays: Rays | None = None
+        if not frames:
+            return
+        bank = PixelBank(frames, most=count, masks=masks)
+        if len(bank):
+            chosen = torch.arange(len(bank))
+            self.rays, self.truth = bank.rays(chosen), bank.colours(chosen)
+
+    def psnr(self, model: HashField) -> float:
+        """dB over the pixels; NaN if there are none."""
+        if self.rays is None:
+            return math.nan
+        model.eval()
+        rgb = render_many(model, self.rays).rgb.clamp(0, 1)
+        return -10 * math.log10(max(float((rgb - self.truth).square().mean()), 1e-12))

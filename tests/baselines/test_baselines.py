@@ -1,0 +1,143 @@
+"""Re-training and fine-tuning on a ball that moved, in closed form: what may teach them, and that they learn it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from refield.baselines.curve import Curve, Point, looks_until, time_to
+from refield.baselines.finetune import finetune
+from refield.baselines.material import material
+from refield.baselines.retrain import retrain
+from refield.field.fit import FitConfig, fit_field
+from refield.field.radiance import Field, HashField, HashFieldConfig
+from refield.field.render import render_camera, render_frame
+from refield.scene.camera import Camera
+from refield.scene.capture import Capture, Frame
+from refield.scene.change import PlacedPhoto, SceneChange
+from refield.scene.images import write_image
+from refield.update.supervision import places_of
+from tests.update.worlds import Ball, BallWorld, at, looking_from, moved
+
+CAMERA = Camera(40, 40, 48.0, 48.0, 20.0, 20.0)
+TINY = FitConfig(
+    steps=200,
+    samples=4096,
+    check_every=200,
+    field=HashFieldConfig(levels=6, finest=64, log2_table=12),
+    finest_auto=False,
+)
+OLD, NEW = at(-0.3, 0.2, 0.25), at(0.4, -0.3, 0.25)
+BEFORE, AFTER = BallWorld((Ball(OLD, 0.25),)), BallWorld((Ball(NEW, 0.25),))
+
+
+def photographed(world: BallWorld, folder: Path, count: int, turn: float = 0.0) -> tuple[Frame, ...]:
+    frames = []
+    for i in range(count):
+        pose = looking_from(turn + 2.4 * i, 2.8, 1.1 + 0.9 * (i % 3))
+        path = folder / f"{i:02d}.png"
+        write_image(path, render_camera(world, CAMERA, pose).rgb)
+        frames.append(Frame(path, CAMERA, path.name, pose))
+    return tuple(frames)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return Capture(photographed(BEFORE, tmp_path_factory.mktemp("before"), 24))
+
+
+@pytest.fixture(scope="module")
+def change(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> SceneChange:
+    new = photographed(AFTER, tmp_path_factory.mktemp("after"), 4, turn=0.7)  # named like the old ones
+    return SceneChange((moved(Ball(OLD, 0.25), NEW),), tuple(PlacedPhoto(f.name, "used", frame=f) for f in new))
+
+
+@pytest.fixture(scope="module")
+def old(capture: Capture) -> HashField:
+    return fit_field(capture, TINY)
+
+
+def error(field: Field, world: BallWorld, mask: torch.Tensor, frame: Frame) -> float:
+    truth = render_camera(world, frame.camera, frame.world_from_cam).rgb
+    return float((render_frame(field, frame).rgb - truth)[mask].square().mean())
+
+
+def test_pixels_that_show_the_change_do_not_teach(capture: Capture, change: SceneChange) -> None:
+    since, places = material(capture, change), places_of(change)
+    assert since.frames == change.frames and set(since.valid) == {f.name for f in capture.frames}
+    for frame in capture.frames:
+        was, now = (torch.from_numpy(p[0].silhouette(frame)) for p in (places.was, places.now))
+        valid = since.valid[frame.name]
+        assert not (valid & (was | now)).any()
+        assert valid.sum() > 0.6 * valid.numel()
+        old, new = (render_camera(w, CAMERA, frame.world_from_cam).rgb for w in (BEFORE, AFTER))
+        assert (old - new)[valid].abs().max() < 0.05
+
+
+def test_an_unsure_mask_leaves_its_photo_out(capture: Capture, change: SceneChange) -> None:
+    (ball,) = change.objects
+    sure = [None] + [torch.zeros(40, 40, dtype=torch.bool) for _ in capture.train[1:]]
+    unsure = replace(change, objects=(replace(ball, masks=tuple(sure)),))
+    valid = material(capture, unsure).valid
+    assert not valid[capture.train[0].name].any() and valid[capture.train[1].name].any()
+
+
+def test_nothing_changed_masks_nothing(capture: Capture) -> None:
+    assert not material(capture, SceneChange()).valid
+
+
+@pytest.mark.parametrize("tuned", [False, True])
+def test_the_new_state_is_learnt(tuned: bool, capture: Capture, change: SceneChange, old: HashField) -> None:
+    kept = {k: v.clone() for k, v in old.state_dict().items()}
+    field = finetune(capture, old, change, TINY) if tuned else retrain(capture, change, TINY)
+    frame = change.frames[0]
+    now = torch.from_numpy(places_of(change).now[0].silhouette(frame))
+    was = torch.from_numpy(places_of(change).was[0].silhouette(frame))
+    for mask in (now, was):  # four photos of 40 x 40 pixels do not show much of what arrived
+        assert error(field, AFTER, mask, frame) < 0.75 * error(old, AFTER, mask, frame)
+    for name, value in old.state_dict().items():
+        assert torch.equal(value, kept[name]), "the old field was changed"
+    assert not field.training and field.sampler.grid.sum() < old.sampler.grid.numel() / 2
+
+
+def test_fine_tuning_begins_where_the_old_field_ended(capture: Capture, change: SceneChange, old: HashField) -> None:
+    first = replace(TINY, steps=1)
+    tuned = finetune(capture, old, change, first)
+    moved_by = (tuned.density_in - old.density_in).abs().max()
+    assert 0 < moved_by <= 1.1 * TINY.rate
+    assert tuned.config == old.config and tuned.contraction.radius == old.contraction.radius
+
+
+def test_a_curve_is_scored_while_the_clock_stands(capture: Capture, change: SceneChange) -> None:
+    def slow(field: Field) -> dict[str, float | None]:
+        time.sleep(0.3)
+        assert isinstance(field, HashField) and not field.training
+        return {"psnr": float(field.density_in.detach().abs().sum())}
+
+    steps = looks_until(12, 3)
+    began = time.perf_counter()
+    curve = Curve(slow, steps)
+    field = retrain(capture, change, replace(TINY, steps=12), curve)
+    whole = time.perf_counter() - began
+    assert [p.step for p in curve.points] == [*steps, 12]
+    assert curve.points[-1].seconds <= whole - 0.3 * len(curve.points) + 0.05
+    assert all(a.seconds < b.seconds for a, b in zip(curve.points, curve.points[1:]))
+    assert curve.points[-1].scores["psnr"] == float(field.density_in.abs().sum())
+
+
+def test_the_same_with_and_without_a_curve(capture: Capture, change: SceneChange) -> None:
+    short = replace(TINY, steps=20)
+    a = retrain(capture, change, short)
+    b = retrain(capture, change, short, Curve(lambda f: {"d": float(f.density(torch.zeros(1, 3)))}, [5, 10]))
+    assert torch.equal(a.encoding.tables, b.encoding.tables)
+
+
+def test_when_a_score_was_reached() -> None:
+    points = [Point(1, 1.0, {"psnr": 20.0}), Point(2, 2.0, {"psnr": None}), Point(3, 3.0, {"psnr": 25.0})]
+    assert time_to(points, "psnr", 20.0) == 1.0 and time_to(points, "psnr", 21.0) == 3.0
+    assert time_to(points, "psnr", 26.0) is None and time_to(points, "ssim", 0.1) is None
+    assert looks_until(2000, 16)[-1] < 2000 and len(looks_until(2000, 16)) == 16 and min(looks_until(5, 16)) == 1
