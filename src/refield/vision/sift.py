@@ -1,0 +1,105 @@
+"""SIFT features of whole photos (Lowe 2004), as compact as a capture of hundreds needs them, and their matching.
+
+Pixels: the top-left pixel's centre is (0.5, 0.5). Descriptors are root-SIFT (Arandjelović & Zisserman 2012) in bytes, as
+COLMAP keeps them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+DIM = 128
+LARGEST = 1600
+"""pixels of the longer side"""
+_CONTRAST = 0.01  # lower than Lowe's: what is weak is only kept where stronger points are few
+_ROWS = 1 << 22  # entries of a table of similarities at a time
+
+
+@dataclass(frozen=True)
+class Features:
+    """What SIFT finds in one photo."""
+
+    xy: NDArray[np.float32]
+    """(N, 2) pixels"""
+    descriptors: NDArray[np.uint8]
+    """(N, 128)"""
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+
+def sift_features(image: NDArray[np.uint8], most: int = 3000) -> Features:
+    """The ``most`` strongest features of an image, (H, W, 3) RGB; of one that is larger than `LARGEST`, scaled down."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    scale = min(LARGEST / max(grey.shape), 1.0)
+    if scale < 1:
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    finder = cv2.SIFT.create(most, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+    points, found = finder.detectAndCompute(grey, None)
+    if not points:
+        return Features(np.zeros((0, 2), np.float32), np.zeros((0, DIM), np.uint8))
+    # OpenCV may return a few more than asked for, where several are equally strong
+    xy = np.array([p.pt for p in points[:most]], np.float32) + np.float32(0.5)
+    xy *= np.array(image.shape[1::-1], np.float32) / np.array(grey.shape[::-1], np.float32)
+    root = np.sqrt(found[:most] / np.maximum(found[:most].sum(1, keepdims=True), 1e-7))
+    return Features(xy, np.clip(np.round(512 * root), 0, 255).astype(np.uint8))
+
+
+def unit(descriptors: NDArray[np.uint8] | Tensor) -> Tensor:
+    """Descriptors (N, 128) as unit vectors, float32."""
+    rows = torch.tensor(descriptors) if isinstance(descriptors, np.ndarray) else descriptors
+    return torch.nn.functional.normalize(rows.float(), dim=1)
+
+
+def match_mutual(a: Tensor, b: Tensor, ratio: float = 0.8) -> NDArray[np.uint32]:
+    """Pairs (K, 2) of rows of ``a`` and ``b``, unit vectors, that are each other's nearest and clearly so (Lowe's ratio)."""
+    if min(len(a), len(b)) < 2:
+        return np.zeros((0, 2), np.uint32)
+    similar = a @ b.T
+    best, at = similar.max(1)
+    back = similar.argmax(0)
+    rows = torch.arange(len(a))
+    similar[rows, at] = -1
+    second = similar.max(1).values
+    keep = (back[at] == rows) & (1 - best < ratio**2 * (1 - second))
+    return torch.stack([rows[keep], at[keep]], 1).numpy().astype(np.uint32)
+
+
+def match_landmarks(query: Tensor, known: Tensor, owner: Tensor, ratio: float = 0.85) -> tuple[Tensor, Tensor, Tensor]:
+    """For each query the landmark it shows, where that is clear.
+
+    Args:
+        query: (Q, 128) unit vectors.
+        known: (M, 128) unit vectors of landmarks as several photos saw them.
+        owner: (M,) which landmark each belongs to: the second nearest of the ratio test is that of another one.
+
+    Returns:
+        rows (K,) of ``query``, landmarks (K,), similarity (K,); a landmark that several claim goes to the most similar.
+    """
+    rows, owners, scores = [], [], []
+    for start in range(0, len(query) if len(known) > 1 else 0, max(_ROWS // len(known), 1)):
+        similar = query[start : start + max(_ROWS // len(known), 1)] @ known.T
+        top, at = similar.topk(min(12, len(known)), dim=1)
+        who = owner[at]
+        other = torch.where(who != who[:, :1], top, top.new_full((), -1.0)).max(1).values
+        keep = (1 - top[:, 0] < ratio**2 * (1 - other)).nonzero()[:, 0]
+        rows.append(keep + start)
+        owners.append(who[keep, 0])
+        scores.append(top[keep, 0])
+    if not rows:
+        none = torch.zeros(0, dtype=torch.long)
+        return none, none, torch.zeros(0)
+    return _one_each(torch.cat(rows), torch.cat(owners), torch.cat(scores))
+
+
+def _one_each(rows: Tensor, owners: Tensor, scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    order = scores.argsort(descending=True, stable=True)
+    _, first = np.unique(owners[order].numpy(), return_index=True)
+    pick = order[torch.from_numpy(np.sort(first))]
+    return rows[pick], owners[pick], scores[pick]
