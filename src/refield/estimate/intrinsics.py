@@ -30,7 +30,7 @@ class Guess:
 def guesses(photo: Taken, capture: Capture, landmarks: Landmarks) -> list[Guess]:
     """What to try, the likeliest first; the last one supposes nothing of the old cameras."""
     old = Counter((f.camera, lens) for f, lens in zip(capture.frames, landmarks.lenses))
-    out = []
+    out: list[Guess] = []
     for (camera, lens), _ in old.most_common():
         guess = _shared(photo, camera) if lens.may_be(photo.lens) else None
         if guess is not None and all(guess.camera != g.camera for g in out):
@@ -56,7 +56,7 @@ def _alike(width: int, height: int, other_width: int, other_height: int) -> bool
 
 
 def _turned(camera: Camera) -> Camera:
-    """Held upright in place of across, or the reverse. Which way it was turned is not known, so the centre is the middle."""
+    """Held upright in place of across, or the reverse; which way round is not known, so the centre is the middle."""
     width, height = camera.height, camera.width
     out = replace(camera, width=width, height=height, fx=camera.fy, fy=camera.fx, p1=0.0, p2=0.0)
     return replace(out, cx=width / 2, cy=height / 2)

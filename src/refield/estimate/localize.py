@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,10 +17,12 @@ from torch import Tensor
 
 from refield.estimate.absolute_pose import Solved, solve
 from refield.estimate.intrinsics import guesses
-from refield.photos.gather import OnProgress, Taken, pixels_of
-from refield.photos.landmarks import Landmarks, describe
+from refield.photos.gather import OnProgress, PhotoConfig, Taken, gather, pixels_of
+from refield.photos.landmarks import Landmarks, describe, read_landmarks, triangulated, write_landmarks
+from refield.photos.motion import Counting
 from refield.scene.capture import Capture, Frame, centres
 from refield.scene.change import PlacedPhoto, Placement
+from refield.scene.images import read_image
 from refield.vision.describer import Describer
 from refield.vision.sift import Features, match_landmarks, sift_features, unit
 
@@ -69,6 +72,55 @@ def localize(
         if on_progress is not None:
             on_progress(i + 1, len(photos))
     return out
+
+
+def localize_photos(
+    folder: Path,
+    known: Known,
+    cache: Path,
+    config: LocalizeConfig = LocalizeConfig(),
+    photos: PhotoConfig | None = None,
+    counting: Counting | None = None,
+) -> list[PlacedPhoto]:
+    """New photos without poses in ``folder``, each placed in the capture's world or rejected with the reason.
+
+    Args:
+        cache: gets their upright copies, which the frames refer to.
+        photos: how they are taken in.
+
+    Raises:
+        InputError: there are no photos.
+    """
+    count = counting or (lambda what: lambda done, total: None)
+    gathered = gather(folder, cache / "new", photos or PhotoConfig(), count("photos"), among=False)
+    placed = localize(gathered.photos, known, config, count("placed"))
+    return [*placed, *(PlacedPhoto(name, "rejected", why) for name, why in gathered.left_out)]
+
+
+def kept_landmarks(path: Path, capture: Capture, cache: Path, counting: Counting | None = None) -> Landmarks:
+    """The landmarks in the file ``path``; of a capture that came with poses they are made now, once.
+
+    Raises:
+        InputError: the capture's photos do not agree with its poses.
+    """
+    landmarks = read_landmarks(path, capture)
+    if landmarks is None:
+        landmarks = triangulated(capture, cache / "posed", counting=counting)
+        write_landmarks(path, landmarks)
+    return landmarks
+
+
+def known_by(
+    capture: Capture, landmarks: Landmarks, describer: Describer | None = None, counting: Counting | None = None
+) -> Known:
+    """What new photos are placed in; a describer looks at every old photo first."""
+    if describer is None:
+        return Known(capture, landmarks, landmarks.globals_)
+    tell, vectors = (counting or (lambda what: lambda done, total: None))("old photos described"), []
+    for i, frame in enumerate(capture.frames):
+        vectors.append(describer.describe(read_image(frame.path).numpy()))
+        tell(i + 1, len(capture.frames))
+    return Known(capture, landmarks, torch.stack(vectors), describer)
 
 
 def _localized(photo: Taken, known: Known, config: LocalizeConfig) -> PlacedPhoto:

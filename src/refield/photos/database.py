@@ -65,7 +65,8 @@ class Database:
     def set_cameras(self, photos: Sequence[Taken], cameras: Sequence[Any]) -> None:
         """Enter photos with their cameras, a COLMAP camera each; photos that are there get theirs anew."""
         pycolmap = quiet_pycolmap()
-        known, ids = self.images, {}
+        ids: dict[int, int] = {}  # of the cameras given, by object
+        known = self.images
         for photo, camera in zip(photos, cameras):
             here = ids.get(id(camera))
             there = self._db.read_image(known[photo.key]) if photo.key in known else None
@@ -165,7 +166,7 @@ def all_pairs(numbers: Sequence[int]) -> list[Pair]:
 
 
 def likely_pairs(numbers: Sequence[int], globals_: Tensor, similar: int, neighbours: int) -> list[Pair]:
-    """Pairs of photos that look alike, by vectors (F, D) in the order of ``numbers``, or were taken after each other."""
+    """Pairs of photos that look alike, by vectors (F, D) in the order of ``numbers``, or follow each other."""
     alike = globals_ @ globals_.T
     alike.fill_diagonal_(-torch.inf)
     nearest = alike.topk(min(similar, len(numbers) - 1), dim=1).indices.tolist()

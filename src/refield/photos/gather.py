@@ -76,9 +76,17 @@ class Gathered:
 
 
 def gather(
-    folder: Path, cache: Path, config: PhotoConfig = PhotoConfig(), on_progress: OnProgress | None = None
+    folder: Path,
+    cache: Path,
+    config: PhotoConfig = PhotoConfig(),
+    on_progress: OnProgress | None = None,
+    *,
+    among: bool = True,
 ) -> Gathered:
     """The photos and the videos' frames in ``folder``, made ready in ``cache``; what was made before is kept.
+
+    Args:
+        among: judge a photo's blur by the others; a few new photos are judged by the old ones instead.
 
     Raises:
         InputError: there are none, or HEIC files and nothing that reads them.
@@ -93,7 +101,7 @@ def gather(
             write_json(cache / INDEX, {"config": asdict(config), "photos": known | records})
         if on_progress is not None:
             on_progress(i + 1, len(sources))
-    return _sorted_out(cache, records)
+    return _sorted_out(cache, records, among)
 
 
 def pixels_of(photo: Taken) -> np.ndarray:
@@ -202,7 +210,7 @@ def _taken(cache: Path, record: dict[str, Any]) -> Taken:
     return Taken(record["name"], cache / FOLDER / key, key, record["width"], record["height"], lens, look)
 
 
-def _sorted_out(cache: Path, records: dict[str, Any]) -> Gathered:
+def _sorted_out(cache: Path, records: dict[str, Any], among: bool) -> Gathered:
     """What can be used, and what not: unreadable, black, blurred beside the others, the same picture twice."""
     everything = [_taken(cache, p) for record in records.values() for p in record["photos"]]
     usual = usual_sharpness([photo.look for photo in everything])
@@ -210,7 +218,9 @@ def _sorted_out(cache: Path, records: dict[str, Any]) -> Gathered:
     photos: dict[str, Taken] = {}
     for photo in everything:
         same = photos.get(photo.key)
-        why = f"is the same picture as {same.name}" if same else photo.look.fault or photo.look.blur(usual)
+        why = f"is the same picture as {same.name}" if same else photo.look.fault
+        if among and not why:
+            why = photo.look.blur(usual)
         if why:
             left_out.append((photo.name, why))
         else:

@@ -52,6 +52,8 @@ class Landmarks:
     """(K, 128) visual words"""
     globals_: Tensor
     """(F, D) unit vectors: which frames look alike"""
+    poses: Tensor
+    """(F, 4, 4) float64, ``world_from_cam``: which capture and which world these are of"""
     lenses: tuple[Lens, ...]
     """(F)"""
     sharpness: float
@@ -62,8 +64,8 @@ class Landmarks:
         return torch.isin(self.frame_of, frames).nonzero()[:, 0]
 
 
-def landmarks_of(model: Any, database: Database, photos: Sequence[Taken]) -> Landmarks:
-    """What structure from motion knows of ``photos``, those of its registered images, in the order of the capture.
+def landmarks_of(model: Any, database: Database, photos: Sequence[Taken], capture: Capture) -> Landmarks:
+    """What a COLMAP model knows of a capture's photos, which go with its frames.
 
     Raises:
         InputError: it has hardly any points.
@@ -84,20 +86,21 @@ def landmarks_of(model: Any, database: Database, photos: Sequence[Taken]) -> Lan
         frame_of=torch.repeat_interleave(torch.arange(len(rows)), torch.tensor([len(r) for r in rows])),
         words=words,
         globals_=globals_of(database, numbers, words),
+        poses=poses_of(capture),
         lenses=tuple(photo.lens for photo in photos),
         sharpness=usual_sharpness([photo.look for photo in photos]),
     )
 
 
 def triangulated(
-    capture: Capture, cache: Path, config: MotionConfig = MotionConfig(), counting: Counting | None = None
+    capture: Capture, cache: Path, config: MotionConfig | None = None, counting: Counting | None = None
 ) -> Landmarks:
     """Landmarks of a capture that came with poses: its photos' features, triangulated from where they were taken.
 
     Raises:
         InputError: a photo cannot be read, or hardly any points agree with the poses.
     """
-    pycolmap = quiet_pycolmap()
+    pycolmap, config = quiet_pycolmap(), config or MotionConfig()
     count = counting or (lambda what: lambda done, total: None)
     photos = _as_taken(capture)
     with Database.opened(cache, config.features) as database:
@@ -111,7 +114,7 @@ def triangulated(
         options.extract_colors = False
         with tempfile.TemporaryDirectory(prefix="refield-") as out:
             found = pycolmap.triangulate_points(model, str(database.path), out, out, options=options)
-        return landmarks_of(found, database, photos)
+        return landmarks_of(found, database, photos, capture)
 
 
 def write_landmarks(path: Path, landmarks: Landmarks) -> None:
@@ -124,8 +127,8 @@ def write_landmarks(path: Path, landmarks: Landmarks) -> None:
     write_bytes(path, data)
 
 
-def read_landmarks(path: Path, frames: int) -> Landmarks | None:
-    """What `write_landmarks` wrote for a capture of so many frames; None if there is none that fits."""
+def read_landmarks(path: Path, capture: Capture) -> Landmarks | None:
+    """What `write_landmarks` wrote for this capture; None if there is nothing, or it is of another."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
@@ -137,17 +140,23 @@ def read_landmarks(path: Path, frames: int) -> Landmarks | None:
         found = Landmarks(
             **tensors, lenses=tuple(Lens(**lens) for lens in facts["lenses"]), sharpness=float(facts["sharpness"])
         )
-        return found if _fits(found, frames) else None
+        return found if _fits(found, capture) else None
     except (SafetensorError, OSError, KeyError, TypeError, ValueError):
         return None
 
 
-def _fits(found: Landmarks, frames: int) -> bool:
-    observations = len(found.descriptors)
+def poses_of(capture: Capture) -> Tensor:
+    """(F, 4, 4) float64."""
+    return torch.stack([frame.world_from_cam for frame in capture.frames])
+
+
+def _fits(found: Landmarks, capture: Capture) -> bool:
+    observations, frames = len(found.descriptors), len(capture.frames)
     inside = len(found.point_of) == len(found.frame_of) == observations > 0
     inside = inside and 0 <= int(found.point_of.min()) <= int(found.point_of.max()) < len(found.points)
     inside = inside and int(found.frame_of.max()) < frames and bool(found.points.isfinite().all())
-    return inside and len(found.globals_) == len(found.lenses) == frames
+    inside = inside and len(found.globals_) == len(found.lenses) == len(found.poses) == frames
+    return inside and bool(torch.allclose(found.poses, poses_of(capture), atol=1e-6))
 
 
 def describe(landmarks: Landmarks, units: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -58,7 +59,7 @@ def look_at(image: NDArray[np.uint8]) -> Look:
     scale = LONGEST / max(grey.shape)
     if scale < 1:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    unit = grey.astype(np.float32) / 255
+    unit = np.asarray(grey, np.float32) / np.float32(255)
     return Look(_sharpness(unit), float(unit.mean()), float(unit.std()))
 
 
@@ -77,14 +78,14 @@ def stops(looks: Sequence[Look]) -> float:
     return float(2.2 * np.log2(max(high, 1e-3) / max(low, 1e-3)))  # sRGB's gamma, roughly
 
 
-def _sharpness(unit: NDArray[np.float32]) -> float:
+def _sharpness(unit: NDArray[Any]) -> float:
     fine, coarse = _slopes(unit, _FINE), _slopes(unit, _COARSE)
     if coarse.max() < 1e-4:
         return 1.0
     return float((fine / np.maximum(coarse, 1e-4)).min())
 
 
-def _slopes(unit: NDArray[np.float32], sigma: float) -> NDArray[np.float64]:
+def _slopes(unit: NDArray[Any], sigma: float) -> NDArray[np.float64]:
     """Mean absolute slope along x, y and both diagonals, (4,)."""
     g = cv2.GaussianBlur(unit, (0, 0), sigma)
     x, y = g[1:-1, 2:] - g[1:-1, :-2], g[2:, 1:-1] - g[:-2, 1:-1]

@@ -10,7 +10,6 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -89,7 +88,7 @@ def reconstruct(
 
 
 def first_cameras(photos: Sequence[Taken]) -> list[Any]:
-    """A COLMAP camera per photo, one object for all photos of one lens and size, with what EXIF says of its focal length."""
+    """A COLMAP camera per photo, one object for all of one lens and size; its focal length by EXIF where that tells."""
     pycolmap = quiet_pycolmap()
     groups = [(p.lens, p.width, p.height) for p in photos]
     counts = Counter(groups)

@@ -52,7 +52,7 @@ def _candidates(video: cv2.VideoCapture, total: int, count: int) -> Iterator[tup
         if i % step == 0:
             there, frame = video.retrieve()
             if there:
-                yield i, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+                yield i, np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _chosen(

@@ -1,7 +1,7 @@
 """SIFT features of whole photos (Lowe 2004), as compact as a capture of hundreds needs them, and their matching.
 
-Pixels: the top-left pixel's centre is (0.5, 0.5). Descriptors are root-SIFT (Arandjelović & Zisserman 2012) in bytes, as
-COLMAP keeps them.
+Pixels: the top-left pixel's centre is (0.5, 0.5). Descriptors are root-SIFT (Arandjelović & Zisserman 2012) in bytes,
+as COLMAP keeps them.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def sift_features(image: NDArray[np.uint8], most: int = 3000) -> Features:
     if not points:
         return Features(np.zeros((0, 2), np.float32), np.zeros((0, DIM), np.uint8))
     # OpenCV may return a few more than asked for, where several are equally strong
-    xy = np.array([p.pt for p in points[:most]], np.float32) + np.float32(0.5)
-    xy *= np.array(image.shape[1::-1], np.float32) / np.array(grey.shape[::-1], np.float32)
+    shrunk = np.array([image.shape[1] / grey.shape[1], image.shape[0] / grey.shape[0]])
+    xy = ((np.array([p.pt for p in points[:most]], np.float64) + 0.5) * shrunk).astype(np.float32)
     root = np.sqrt(found[:most] / np.maximum(found[:most].sum(1, keepdims=True), 1e-7))
     return Features(xy, np.clip(np.round(512 * root), 0, 255).astype(np.uint8))
 
@@ -58,7 +58,7 @@ def unit(descriptors: NDArray[np.uint8] | Tensor) -> Tensor:
 
 
 def match_mutual(a: Tensor, b: Tensor, ratio: float = 0.8) -> NDArray[np.uint32]:
-    """Pairs (K, 2) of rows of ``a`` and ``b``, unit vectors, that are each other's nearest and clearly so (Lowe's ratio)."""
+    """Pairs (K, 2) of rows of ``a`` and ``b``, unit vectors: mutual nearest neighbours that pass Lowe's ratio test."""
     if min(len(a), len(b)) < 2:
         return np.zeros((0, 2), np.uint32)
     similar = a @ b.T
