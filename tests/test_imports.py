@@ -20,6 +20,7 @@ MAY_IMPORT = {
     "update": {"scene", "field", "vision", "artefacts"},
     "evaluate": {"scene", "field", "vision"},
     "report": {"scene", "field", "vision"},
+    "check": {"scene", "field", "vision", "photos"},
     "history": {"scene", "field", "update", "workspace", "artefacts"},
     "cli": {"scene", "commands"},
     "commands": None,  # joins everything

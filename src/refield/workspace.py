@@ -120,10 +120,17 @@ class Workspace:
 
         Unlike the workspace it is there from the beginning, so that what was interrupted goes on.
         """
+        existed = path.exists()
         with writable(path):
             (path / CACHE).mkdir(parents=True, exist_ok=True)
-        with locked(path):
-            yield path / CACHE
+        try:
+            with locked(path):
+                yield path / CACHE
+        finally:
+            if not any((path / CACHE).iterdir()):
+                (path / CACHE).rmdir()
+                if not existed:
+                    shutil.rmtree(path, ignore_errors=True)
 
     @property
     def cache(self) -> Path:

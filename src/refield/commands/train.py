@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
 from refield.field.fit import FitConfig, NonFiniteError, fit_field
-from refield.field.memory import Memory, memory_of
+from refield.field.memory import Memory, memory_fault, memory_of
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
 from refield.photos.landmarks import Landmarks, write_landmarks
 from refield.photos.sources import holds_photos
@@ -118,8 +117,6 @@ def _check_cameras(data: Path, capture: Capture) -> None:
 
 def _check_memory(data: Path, needed: Memory) -> None:
     """Refuse what would not fit, with the number, before the machine starts to swap."""
-    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed.total > there / 2:
-        what = f"its photos take {needed.photos / 1e9:.1f} GB of memory, of which there are {there / 1e9:.1f}"
-        most = max((there / 2 - needed.total + needed.photos) / 1e9, 0.1)
-        raise InputError(data, what, f"give --fit.photo-memory {most:.1f} or less, or scale the photos down")
+    fault = memory_fault(needed)
+    if fault is not None:
+        raise InputError(data, *fault)

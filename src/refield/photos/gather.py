@@ -111,9 +111,9 @@ def pixels_of(photo: Taken) -> np.ndarray:
 
 def _need_heif(sources: Sequence[Source]) -> None:
     if sources and importlib.util.find_spec("pillow_heif") is None:
-        what = f"and {len(sources) - 1} more are HEIC photos, which need the package pillow-heif"
-        remedy = "pip install 'refield[heic]', or convert them to JPEG"
-        raise InputError(sources[0].path, what if len(sources) > 1 else what.partition("more are ")[2], remedy)
+        more = f" (and {len(sources) - 1} more files)" if len(sources) > 1 else ""
+        what = f"is HEIC{more}, which needs the package pillow-heif"
+        raise InputError(sources[0].path, what, "pip install 'refield[heic]', or convert to JPEG")
 
 
 def _read_index(cache: Path, config: PhotoConfig) -> dict[str, Any]:
