@@ -77,7 +77,7 @@ def test_evaluate_writes_numbers(place, capsys):
 def believing(monkeypatch, *kinds):
     """Let the estimate say that an object of each kind changed in the middle of the scene."""
 
-    def estimate(capture, field, frames, config, on_stage=None, known=()):
+    def estimate(capture, field, frames, config, on_stage=None, models=None, known=()):
         for name in ("look", "decide"):
             on_stage(name)
         grid = OccupancyGrid(torch.tensor([[-0.3, -0.3, -0.3], [0.3, 0.3, 0.3]]), torch.ones(5, 5, 5))
@@ -155,7 +155,7 @@ def test_an_update_that_does_harm_is_not_kept(place, monkeypatch, capsys):
 
 
 def test_no_usable_photo(place, monkeypatch, capsys):
-    def estimate(capture, field, frames, config, on_stage=None, known=()):
+    def estimate(capture, field, frames, config, on_stage=None, models=None, known=()):
         return SceneChange(photos=tuple(PlacedPhoto(f.name, "rejected", "98 % changed") for f in frames))
 
     monkeypatch.setattr(update, "estimate_change", estimate)

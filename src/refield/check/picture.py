@@ -33,11 +33,10 @@ def camera_picture(capture: Capture, world: World) -> Tensor:
     for i, half in enumerate(halves):
         sheet.paste(half, (i * (_SIDE + 8), _CAPTION))
     unit = 10 ** math.floor(math.log10(max(reach, 1e-12)))
-    told = f"from above: {len(capture.frames)} cameras, {len(capture.points)} points"
-    draw.text((8, 6), told, fill=_INK, font=font)
-    draw.text(
-        (_SIDE + 16, 6), f"from the side; the bar is {unit:g} unit{'' if unit == 1 else 's'}", fill=_INK, font=font
-    )
+    above = f"from above: {len(capture.frames)} cameras (violet: held out), {len(capture.points)} points"
+    draw.text((8, 6), above, fill=_INK, font=font)
+    side = f"from the side; the bar is {unit:g} unit{'' if unit == 1 else 's'}"
+    draw.text((_SIDE + 16, 6), side, fill=_INK, font=font)
     length = unit / reach * _SIDE / 2
     draw.line([(2 * _SIDE - length - 8, 20), (2 * _SIDE - 8, 20)], fill=_INK, width=3)
     return torch.from_numpy(np.array(sheet))

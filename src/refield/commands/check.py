@@ -18,7 +18,6 @@ from refield.field.fit import FitConfig
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
 from refield.photos.gather import gather
 from refield.photos.look import stops, usual_sharpness
-from refield.photos.sources import holds_photos
 from refield.scene.errors import InputError
 from refield.scene.images import is_ours, write_image
 from refield.scene.left_out import named
@@ -28,7 +27,7 @@ from refield.workspace import MARKER, Workspace
 
 @dataclass(frozen=True)
 class Check:
-    """Look a capture over: what is there, what will be skipped and why, what it will cost. Ends with 2 if not usable."""
+    """Look a capture over: what is there, what will be skipped and why, what it costs. Ends with 2 if not usable."""
 
     data: Annotated[Path, arg(metavar="DATA"), Positional]
     """what `refield train` takes, or a workspace"""
@@ -71,7 +70,7 @@ def check(options: Check, clock: Clock) -> Survey:
     """
     if (options.data / MARKER).is_file():
         return _posed(options, clock, workspace=True)
-    if is_posed(options.data) or not holds_photos(options.data):
+    if is_posed(options.data):
         return _posed(options, clock)
     if options.work is not None:
         clock.stage("find where the photos were taken")
@@ -87,10 +86,7 @@ def check(options: Check, clock: Clock) -> Survey:
 
 def _posed(options: Check, clock: Clock, *, workspace: bool = False) -> Survey:
     clock.stage("look at the photos")
-    if workspace:
-        capture = Workspace.open(options.data).capture()
-    else:
-        capture = load_capture(options.data, warn=clock.warn)
+    capture = Workspace.open(options.data).capture() if workspace else load_capture(options.data, warn=clock.warn)
     with clock.counters() as counting:
         return survey_capture(capture, options.fit, (), counting("photos"))
 

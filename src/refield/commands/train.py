@@ -13,7 +13,6 @@ from refield.field.fit import FitConfig, NonFiniteError, fit_field
 from refield.field.memory import Memory, memory_fault, memory_of
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
 from refield.photos.landmarks import Landmarks, write_landmarks
-from refield.photos.sources import holds_photos
 from refield.scene.capture import Capture, centres
 from refield.scene.errors import InputError
 from refield.scene.load import is_posed, load_capture
@@ -90,7 +89,7 @@ def train(task: Sources, clock: Clock, config: FitConfig, *, overwrite: bool, ma
 
 
 def _loaded(task: Sources, clock: Clock) -> tuple[Capture, Landmarks | None]:
-    if is_posed(task.data) or not holds_photos(task.data):
+    if is_posed(task.data):
         clock.stage("load the capture")
         return load_capture(task.data, warn=clock.warn), None
     clock.stage("find where the photos were taken")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +19,6 @@ from refield.evaluate import Report, evaluate
 from refield.field.radiance import Field
 from refield.history import changed_visits, known_objects, retouched, state, untouched_psnr
 from refield.photos.gather import PhotoConfig
-from refield.photos.sources import holds_photos
 from refield.report import summary, write_report
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import PlacedPhoto, SceneChange
@@ -86,7 +85,7 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
     workspace = Workspace.open(options.work)
     models = options.estimate.models.open()
     given = None
-    if is_posed(options.photos) or not holds_photos(options.photos):
+    if is_posed(options.photos):
         given = load_new_photos(options.photos, workspace.capture(), warn=clock.warn)
     with workspace.writing(), tempfile.TemporaryDirectory(prefix="refield-") as scratch:
         placed = _localized(options, workspace, models, clock) if given is None else _as_given(given)
@@ -96,7 +95,9 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         old = state(workspace, number)
         capture = _capture_now(workspace, number, old, clock, Path(scratch))
         known = known_objects(old)
-        change = estimate_change(capture, old, frames, options.estimate, clock.stage, models, known).among(placed)
+        change = estimate_change(
+            capture, old, frames, options.estimate, on_stage=clock.stage, models=models, known=known
+        ).among(placed)
         _need_a_photo(options.photos, change)
         new = _updated(capture, old, change, options.update, clock)
         clock.stage("report")
@@ -109,7 +110,8 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
                 save_updated(folder, new)
             clock.stop()
             title = f"{options.work.resolve().name}, visit {number + 1}"
-            write_report(folder, page(title, change, (old, new), clock, evaluation, facts or {}))
+            report = page(title, change, (old, new), clock, evaluation, facts or {})
+            write_report(folder, replace(report, world=workspace.world()))
     return Visit(workspace.visit(number + 1), change, evaluation)
 
 

@@ -9,6 +9,7 @@ from typing import Literal
 
 from refield.scene import images
 from refield.scene.errors import InputError
+from refield.scene.left_out import named
 
 HEIC = (".heic", ".heif", ".hif")
 VIDEO = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -27,7 +28,7 @@ class Source:
 
 
 def find_sources(folder: Path) -> tuple[Source, ...]:
-    """The pictures and videos in ``folder`` and below, hidden ones and masks left out; numbers in names count as such.
+    """The pictures and videos in ``folder``, or in its ``images/``; ``IMG_9`` comes before ``IMG_10``.
 
     Raises:
         InputError: there is no such folder, nothing in it can be used, or there are too many files.
@@ -35,27 +36,35 @@ def find_sources(folder: Path) -> tuple[Source, ...]:
     if not folder.is_dir():
         what = "is not a folder" if folder.exists() else "there is no such folder"
         raise InputError(folder, what, "give the folder that holds the photos")
-    found = [source for path in folder.rglob("*") if (source := _source(folder, path)) is not None]
+    found = _found(folder)
     if not found:
+        below = sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".") and _found(p))
+        if below:
+            what = f"holds no photos itself, but folders of photos ({named(below)})"
+            raise InputError(folder, what, "give one of them: each visit's photos are a folder of their own")
         kinds = ", ".join((*images.SUFFIXES, *HEIC, *VIDEO))
-        raise InputError(folder, "holds no photos", f"give a folder with files that end in one of {kinds}")
+        what = "holds no photos, no transforms.json and no COLMAP model"
+        raise InputError(folder, what, f"photos are files that end in one of {kinds}")
     if len(found) > MOST:
         raise InputError(folder, f"holds {len(found)} photos, the limit is {MOST}", "give the folder of one capture")
     return tuple(sorted(found, key=lambda s: _natural(s.name)))
 
 
-def holds_photos(folder: Path) -> bool:
-    """Whether there is anything that `find_sources` would find."""
-    return folder.is_dir() and any(_source(folder, path) for path in folder.rglob("*"))
+def _found(folder: Path) -> list[Source]:
+    for place in (folder, folder / "images"):
+        if place.is_dir():
+            found = [source for path in place.iterdir() if (source := _source(folder, path)) is not None]
+            if found:
+                return found
+    return []
 
 
 def _source(folder: Path, path: Path) -> Source | None:
-    relative = path.relative_to(folder)
-    hidden = path.name.startswith(".") or any(part.startswith((".", "masks")) for part in relative.parts[:-1])
     suffix = path.suffix.lower()
+    hidden = path.name.startswith(".")
     if hidden or not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
         return None
-    name = relative.as_posix()
+    name = path.relative_to(folder).as_posix()
     if suffix in images.SUFFIXES:
         return Source(path, name, "picture")
     if suffix in HEIC:
@@ -64,6 +73,6 @@ def _source(folder: Path, path: Path) -> Source | None:
 
 
 def _natural(name: str) -> tuple[list[tuple[int, str]], str]:
-    """``IMG_9`` before ``IMG_10``."""
+    """Numbers in a name count as numbers."""
     parts = re.findall(r"\d+|\D+", name.lower())
     return [(int(p), "") if p.isdecimal() and p.isascii() else (-1, p) for p in parts], name
