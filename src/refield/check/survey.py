@@ -13,6 +13,7 @@ import torch
 from refield.check.coverage import Coverage, coverage_of
 from refield.field.fit import FitConfig
 from refield.field.memory import Memory, memory_fault, memory_of
+from refield.photos.features import photo_features
 from refield.photos.gather import Gathered, Taken, pixels_of
 from refield.photos.lens import Lens
 from refield.photos.look import Look, look_at, stops, usual_sharpness
@@ -22,12 +23,11 @@ from refield.scene.capture import Capture, Frame, centres
 from refield.scene.images import read_image
 from refield.scene.left_out import named
 from refield.scene.world import World, world_of
-from refield.vision.sift import sift_features
 
 FEW, TOO_FEW = 30, 3
 _SPREAD = 1.0  # stops, from which on exposure is spoken of
 _GAP, _SEEN = 120.0, 3.0
-_SIFT_HERE = 0.22  # seconds a megapixel, on the machine that the rest was measured on: 2 cores of a Xeon
+_SIFT_HERE = 1.3  # seconds a megapixel, on the machine that the rest was measured on: 2 cores of a Xeon
 _PER_PAIR, _PER_POSE, _PER_STEP = 0.08, 0.3, 0.0085  # seconds there
 
 
@@ -109,7 +109,7 @@ def _unplaced(photo: Taken) -> Frame:
 def _seconds_per_megapixel(image: object) -> float:
     began = time.perf_counter()
     pixels = torch.as_tensor(image)
-    sift_features(pixels.numpy())
+    photo_features(pixels.numpy())
     return (time.perf_counter() - began) / (pixels.shape[0] * pixels.shape[1] / 1e6)
 
 

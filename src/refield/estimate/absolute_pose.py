@@ -14,6 +14,7 @@ from torch import Tensor
 from refield.estimate.intrinsics import Guess
 from refield.scene.camera import Camera
 from refield.scene.colmap import camera_of, colmap_camera, quiet_pycolmap
+from refield.scene.errors import InputError
 from refield.scene.pose import invert, rigid
 
 _F64 = NDArray[np.float64]
@@ -83,7 +84,10 @@ def _ransac(xy: _F64, xyz: _F64, guess: Guess, most_error: float) -> Solved | No
         return None
     matrix = torch.from_numpy(np.array(found["cam_from_world"].matrix(), np.float64))
     pose = invert(rigid(matrix[:, :3], matrix[:, 3]))
-    used = camera_of(camera, "a new photo") if guess.refine else guess.camera
+    try:
+        used = camera_of(camera, "a new photo") if guess.refine else guess.camera
+    except InputError:  # refined into what is no camera: a few wrong matches can do that
+        return None
     return _judged(xy, xyz, (pose, used, guess.how), most_error)
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from refield.estimate.absolute_pose import Solved, solve
 from refield.estimate.intrinsics import guesses
+from refield.photos.features import photo_features
 from refield.photos.gather import OnProgress, PhotoConfig, Taken, gather, pixels_of
 from refield.photos.landmarks import Landmarks, describe, read_landmarks, triangulated, write_landmarks
 from refield.photos.motion import Counting
@@ -24,7 +25,7 @@ from refield.scene.capture import Capture, Frame, centres
 from refield.scene.change import PlacedPhoto, Placement
 from refield.scene.images import read_image
 from refield.vision.describer import Describer
-from refield.vision.sift import Features, match_landmarks, sift_features, unit
+from refield.vision.sift import Features, match_landmarks, unit
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ def _localized(photo: Taken, known: Known, config: LocalizeConfig) -> PlacedPhot
     if why:
         return PlacedPhoto(photo.name, "rejected", why)
     image = pixels_of(photo)
-    features = sift_features(image, config.features)
+    features = photo_features(image, config.features)
     units = unit(features.descriptors)
     alike = _alike(image, units, known)
     first = _placed(photo, features, units, alike[: config.similar], known, config)

@@ -1,7 +1,7 @@
 """COLMAP's database as the memory of structure from motion: cameras, features and matches, each done once.
 
-Features are ours (`refield.vision.sift`), the geometry of pairs is verified by pycolmap. Images are named by the
-content of their photos, so that a photo that is added later finds what is known of the others.
+Features and the geometry of pairs are pycolmap's, the pairing of features is ours (`refield.vision.sift`). Images are named
+by the content of their photos, so that a photo that is added later finds what is known of the others.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from refield.photos.features import photo_features
 from refield.photos.gather import OnProgress, Taken, pixels_of
 from refield.scene.colmap import quiet_pycolmap
 from refield.scene.files import log_warning
 from refield.scene.left_out import Warn
-from refield.vision.sift import DIM, match_mutual, sift_features, unit
+from refield.vision.sift import DIM, match_mutual, unit
 
 NAME = "features.db"
 LEAST = 15
@@ -93,7 +94,7 @@ class Database:
         for i, photo in enumerate(photos):
             number = numbers[photo.key]
             if not self._db.exists_descriptors(number):
-                found = sift_features(pixels_of(photo), self._features)
+                found = photo_features(pixels_of(photo), self._features)
                 self._db.write_keypoints(number, found.xy)
                 rows = found.descriptors.reshape(-1, DIM)
                 kind = pycolmap.FeatureExtractorType.SIFT

@@ -1,4 +1,4 @@
-"""SIFT features of whole photos (Lowe 2004), as compact as a capture of hundreds needs them, and their matching.
+"""SIFT descriptors (Lowe 2004), as compact as a capture of hundreds of photos needs them, and their matching.
 
 Pixels: the top-left pixel's centre is (0.5, 0.5). Descriptors are root-SIFT (Arandjelović & Zisserman 2012) in bytes,
 as COLMAP keeps them.
@@ -8,22 +8,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 DIM = 128
-LARGEST = 1600
-"""pixels of the longer side"""
-_CONTRAST = 0.01  # lower than Lowe's: what is weak is only kept where stronger points are few
 _ROWS = 1 << 22  # entries of a table of similarities at a time
 
 
 @dataclass(frozen=True)
 class Features:
-    """What SIFT finds in one photo."""
+    """What is found in one photo."""
 
     xy: NDArray[np.float32]
     """(N, 2) pixels"""
@@ -32,23 +28,6 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.xy)
-
-
-def sift_features(image: NDArray[np.uint8], most: int = 3000) -> Features:
-    """The ``most`` strongest features of an image, (H, W, 3) RGB; of one that is larger than `LARGEST`, scaled down."""
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    scale = min(LARGEST / max(grey.shape), 1.0)
-    if scale < 1:
-        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    finder = cv2.SIFT.create(most, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
-    points, found = finder.detectAndCompute(grey, None)
-    if not points:
-        return Features(np.zeros((0, 2), np.float32), np.zeros((0, DIM), np.uint8))
-    # OpenCV may return a few more than asked for, where several are equally strong
-    shrunk = np.array([image.shape[1] / grey.shape[1], image.shape[0] / grey.shape[0]])
-    xy = ((np.array([p.pt for p in points[:most]], np.float64) + 0.5) * shrunk).astype(np.float32)
-    root = np.sqrt(found[:most] / np.maximum(found[:most].sum(1, keepdims=True), 1e-7))
-    return Features(xy, np.clip(np.round(512 * root), 0, 255).astype(np.uint8))
 
 
 def unit(descriptors: NDArray[np.uint8] | Tensor) -> Tensor:
