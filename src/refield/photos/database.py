@@ -1,7 +1,7 @@
 """COLMAP's database as the memory of structure from motion: cameras, features and matches, each done once.
 
-Features and the geometry of pairs are pycolmap's, the pairing of features is ours (`refield.vision.sift`). Images are named
-by the content of their photos, so that a photo that is added later finds what is known of the others.
+Features and the geometry of pairs are pycolmap's, the pairing of features is ours (`refield.vision.sift`). Images are
+named by the content of their photos, so that a photo that is added later finds what is known of the others.
 """
 
 from __future__ import annotations

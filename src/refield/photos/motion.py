@@ -27,6 +27,7 @@ from refield.vision.vlad import learn_words, vlad
 Counting = Callable[[str], OnProgress]
 """Called with what is counted; gives what is called with how many are done, and how many there are"""
 _FULL_LENS = 8  # photos of one camera, from which on its whole distortion is looked for
+_CENTRE = 30  # and its principal point: of fewer it comes out worse than the middle
 
 
 @dataclass(frozen=True)
@@ -160,15 +161,23 @@ def _mapped(photos: Sequence[Taken], database: Database, on_progress: OnProgress
 
 
 def _centred(model: Any) -> None:
-    """Refine the principal points too, now that everything is in place: half a degree of a pose may hang on it."""
+    """Refine the principal points too, now that everything is in place: half a degree of a pose may hang on it.
+
+    Cameras of a few photos, of which it cannot be told, stay as they are.
+    """
     pycolmap = quiet_pycolmap()
     seen = Counter(model.images[i].camera_id for i in model.reg_image_ids())
-    if min(seen.values()) < _FULL_LENS:  # of a few photos it cannot be told
+    if max(seen.values()) < _CENTRE:
         return
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_principal_point = True
-    options.print_summary = False
-    pycolmap.bundle_adjustment(model, options)
+    config, options = pycolmap.BundleAdjustmentConfig(), pycolmap.BundleAdjustmentOptions()
+    for number in model.reg_image_ids():
+        config.add_image(number)
+    for camera, count in seen.items():
+        if count < _CENTRE:
+            config.set_constant_cam_intrinsics(camera)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options.refine_principal_point, options.print_summary = True, False
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
 def _apart(photos: Sequence[Taken], what: str) -> InputError:

@@ -72,7 +72,7 @@ def _source(folder: Path, path: Path) -> Source | None:
     return Source(path, name, "video") if suffix in VIDEO else None
 
 
-def _natural(name: str) -> tuple[list[tuple[int, str]], str]:
+def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
     """Numbers in a name count as numbers."""
     parts = re.findall(r"\d+|\D+", name.lower())
-    return [(int(p), "") if p.isdecimal() and p.isascii() else (-1, p) for p in parts], name
+    return [(0, int(p), "") if p.isdecimal() and p.isascii() else (1, 0, p) for p in parts], name
