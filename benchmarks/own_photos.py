@@ -1,7 +1,7 @@
 """Photos alone: how well structure from motion finds their poses, and localization those of new ones.
 
     python benchmarks/own_photos.py --data DATA                   # real photographs: DATA/fox
-    python benchmarks/own_photos.py --data DATA --whole           # and DATA/fox_moved all the way, train and update
+    python benchmarks/own_photos.py --data DATA --whole           # DATA/fox_moved all the way, train and update
     python benchmarks/own_photos.py --world FOLDER [FOLDER …]     # what `refield synth` wrote, poses withheld
 
 Prints one table per section, in Markdown, with date, machine and command. What takes long is kept in ``--work``.
@@ -48,18 +48,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with fox/ and fox_moved/ (real photographs)")
     parser.add_argument("--world", type=Path, nargs="*", default=[], help="folders that `refield synth` wrote")
-    parser.add_argument("--whole", action="store_true", help="train and update fox_moved, from photos alone")
+    parser.add_argument("--whole", action="store_true", help="only train and update fox_moved, from photos alone")
     parser.add_argument(
         "--work", type=Path, default=Path("build/own-photos"), help="where intermediate things are kept"
     )
     options = parser.parse_args()
     print(_conditions())
-    if options.data is not None:
+    if options.data is not None and options.whole:
+        _whole(options.data / "fox_moved", options.work)
+    elif options.data is not None:
         found = _motion("fox", options.data / "fox" / "images", options.data / "fox", options.work / "fox")
         _localization(options.data / "fox" / "images", found, options.work)
         _rejected(options.data / "fox" / "images", found, options.work)
-        if options.whole:
-            _whole(options.data / "fox_moved", options.work)
     for world in options.world:
         _world(world, options.work / f"world-{world.name}")
     return 0

@@ -1,20 +1,24 @@
 """The commands join the stages: what they write, print and return."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import torch
 
 from refield.cli import COMMANDS, main
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
-from refield.scene.images import read_image
+from refield.scene.images import read_image, write_image
+from refield.workspace import Workspace
 from tests.conftest import HERE, TINY_FIT
 from tests.folders import contents
+from tests.photos.room import write_photos
 
 update = pytest.importorskip("refield.commands.update")
 
@@ -234,3 +238,37 @@ def test_a_killed_training_is_no_workspace_and_can_be_repeated(place):
     assert list(place.glob("out/.part-*")) and not (place / "out/refield.json").exists()
     assert main(["train", "data", "out", *TINY_FIT]) == 0
     assert not list(place.glob("out/.part-*"))
+
+
+def test_photos_alone_all_the_way(reconstructed, tmp_path, monkeypatch, capsys):
+    """Train from photos, update from photos: placed ones are compared, one that is black is kept as rejected."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(reconstructed.folder / "photos", "before")
+    shutil.copytree(reconstructed.folder / "cache", "work/.photos")
+    assert main(["train", "before", "work", "--scale", "0.5", "--poses.motion.features", "500", *TINY_FIT]) == 0
+    assert "8 of 8 photos placed" in capsys.readouterr().err
+    workspace = Workspace.open(Path("work"))
+    assert workspace.world().metres_per_unit == 0.5 and workspace.landmarks.is_file()
+
+    write_photos(Path("elsewhere"), 2, seed=7)
+    before = contents(Path("work"))
+    assert main(["update", "work", "elsewhere", "--localize.features", "500"]) == 2
+    said = capsys.readouterr().err
+    assert re.search(r"elsewhere: none of its 2 photos can be placed \(0.png cannot be placed", said)
+    assert contents(Path("work")) == before
+
+    write_photos(Path("after"), 2, turn=0.5)
+    write_image(Path("after/black.png"), torch.zeros(150, 200, 3))
+    monkeypatch.setattr(update, "estimate_change", believe_photos)
+    assert main(["update", "work", "after", "--localize.features", "500"]) == 0
+    assert "left out: black.png is black" in capsys.readouterr().err
+    told = json.loads(Path("work/visits/001/change.json").read_text())["photos"]
+    assert [(p["file"], p["status"]) for p in told] == [("0.png", "used"), ("1.png", "used"), ("black.png", "rejected")]
+    assert told[0]["placement"]["inliers"] > 100 and "is black" in told[2]["why"]
+    page = Path("work/visits/001/report.html").read_text()
+    assert "black.png" in page and "points that agree" in page
+
+
+def believe_photos(capture, field, frames, config, on_stage=None, models=None, known=()):
+    """Nothing changed, and all photos were used."""
+    return SceneChange(photos=tuple(PlacedPhoto(f.name, "used", frame=f) for f in frames))
