@@ -12,9 +12,9 @@ import torch
 from refield.estimate.absolute_pose import solve
 from refield.estimate.intrinsics import Guess, guesses
 from refield.estimate.localize import LocalizeConfig, kept_landmarks, known_by, localize_photos
-from refield.photos.gather import Taken
 from refield.photos.lens import Lens
 from refield.photos.look import Look
+from refield.photos.taken import Taken
 from refield.scene.camera import Camera
 from refield.scene.images import write_image
 from refield.scene.pose import angle_between, exp, transform

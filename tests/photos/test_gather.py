@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 from refield.photos import gather as module
-from refield.photos.gather import PhotoConfig, gather, pixels_of
+from refield.photos.gather import gather
 from refield.photos.lens import Lens
+from refield.photos.taken import PhotoConfig, pixels_of
 from refield.scene.errors import InputError
 from tests.photos.room import texture
 
@@ -95,7 +96,7 @@ def test_what_was_made_is_kept_and_what_changed_is_made_again(tmp_path, monkeypa
 def test_heic_needs_its_package(tmp_path, monkeypatch):
     (tmp_path / "IMG_1.HEIC").touch()
     (tmp_path / "IMG_2.HEIC").touch()
-    monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("refield.photos.taken.importlib.util.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"IMG_1.HEIC: is HEIC \(and 1 more files\).*pip install 'refield\[heic\]'"):
         gather(tmp_path, tmp_path / "cache")
 
@@ -103,7 +104,9 @@ def test_heic_needs_its_package(tmp_path, monkeypatch):
 def test_heic_is_read_where_the_package_is_there(tmp_path):
     heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed")
     heif.register_heif_opener()
-    save(tmp_path / "in" / "a.heic", picture().rotate(90, expand=True), orientation=6, make="Acme")
+    (tmp_path / "in").mkdir()
+    lying = picture().rotate(90, expand=True)  # HEIC turns itself; pillow-heif writes that only for a tag in bytes
+    lying.save(tmp_path / "in" / "a.heic", exif=exif(orientation=6, make="Acme").tobytes())
     (photo,) = gather(tmp_path / "in", tmp_path / "cache").photos
     assert (photo.width, photo.height, photo.lens.name) == (320, 240, "Acme")
 

@@ -12,10 +12,10 @@ import torch
 from refield.photos import database as database_module
 from refield.photos.capture import capture_from_photos
 from refield.photos.database import all_pairs, likely_pairs
-from refield.photos.gather import Taken
 from refield.photos.lens import Lens
 from refield.photos.look import Look
 from refield.photos.motion import first_cameras
+from refield.photos.taken import Taken
 from refield.scene.errors import InputError
 from refield.scene.similarity import between, pose_errors
 from refield.scene.world import world_of

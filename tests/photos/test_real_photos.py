@@ -10,8 +10,8 @@ import pytest
 
 from refield.estimate.localize import LocalizeConfig, known_by, localize_photos
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
-from refield.photos.gather import PhotoConfig
 from refield.photos.motion import MotionConfig
+from refield.photos.taken import PhotoConfig
 from refield.scene.capture import Capture
 from refield.scene.similarity import between, pose_errors
 from refield.scene.transforms_json import load_transforms

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from refield.photos.gather import PhotoConfig, gather
+from refield.photos.gather import gather
 from refield.photos.look import look_at
+from refield.photos.taken import PhotoConfig
 from refield.photos.video import sharp_frames
 from tests.photos.room import texture
 

@@ -68,7 +68,7 @@ def test_round_trip(tmp_path, capture, change):
         for x, y in ((a.new_from_old, b.new_from_old), (a.covariance, b.covariance)):
             assert x is y is None or torch.equal(x, y)
     for a, b in zip(change.photos, back.photos, strict=True):
-        assert (a.name, a.status, a.why) == (b.name, b.status, b.why)
+        assert (a.name, a.status, a.why, a.placement) == (b.name, b.status, b.why, b.placement)
         if a.frame is not None:
             assert b.frame.path == a.frame.path.resolve() and b.frame.camera == a.frame.camera
             assert torch.equal(a.frame.world_from_cam, b.frame.world_from_cam)

@@ -14,10 +14,11 @@ from refield.check.coverage import Coverage, coverage_of
 from refield.field.fit import FitConfig
 from refield.field.memory import Memory, memory_fault, memory_of
 from refield.photos.features import photo_features
-from refield.photos.gather import Gathered, Taken, pixels_of
+from refield.photos.gather import Gathered
 from refield.photos.lens import Lens
 from refield.photos.look import Look, look_at, stops, usual_sharpness
 from refield.photos.motion import MotionConfig
+from refield.photos.taken import Taken, pixels_of
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, centres
 from refield.scene.images import read_image

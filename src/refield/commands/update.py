@@ -18,7 +18,7 @@ from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.evaluate import Report, evaluate
 from refield.field.radiance import Field
 from refield.history import changed_visits, known_objects, retouched, state, untouched_psnr
-from refield.photos.gather import PhotoConfig
+from refield.photos.taken import PhotoConfig
 from refield.report import summary, write_report
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import PlacedPhoto, SceneChange

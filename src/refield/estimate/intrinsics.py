@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, replace
 
-from refield.photos.gather import Taken
 from refield.photos.landmarks import Landmarks
 from refield.photos.lens import Lens
+from refield.photos.taken import Taken
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture
 

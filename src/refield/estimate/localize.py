@@ -18,9 +18,10 @@ from torch import Tensor
 from refield.estimate.absolute_pose import Solved, solve
 from refield.estimate.intrinsics import guesses
 from refield.photos.features import photo_features
-from refield.photos.gather import OnProgress, PhotoConfig, Taken, gather, pixels_of
+from refield.photos.gather import OnProgress, gather
 from refield.photos.landmarks import Landmarks, describe, read_landmarks, triangulated, write_landmarks
 from refield.photos.motion import Counting
+from refield.photos.taken import PhotoConfig, Taken, pixels_of
 from refield.scene.capture import Capture, Frame, centres
 from refield.scene.change import PlacedPhoto, Placement
 from refield.scene.images import read_image

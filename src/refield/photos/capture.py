@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from refield.photos.database import Database
-from refield.photos.gather import Gathered, PhotoConfig, gather
+from refield.photos.gather import Gathered, gather
 from refield.photos.landmarks import NAME, Landmarks, landmarks_of, write_landmarks
 from refield.photos.motion import Counting, Motion, MotionConfig, reconstruct
+from refield.photos.taken import PhotoConfig
 from refield.scene.capture import Capture
 from refield.scene.errors import InputError
 from refield.scene.files import log_warning

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.photos.features import photo_features
-from refield.photos.gather import OnProgress, Taken, pixels_of
+from refield.photos.gather import OnProgress
+from refield.photos.taken import Taken, pixels_of
 from refield.scene.colmap import quiet_pycolmap
 from refield.scene.files import log_warning
 from refield.scene.left_out import Warn

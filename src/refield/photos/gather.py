@@ -2,68 +2,26 @@
 
     CACHE/photos/<hash>.jpg   CACHE/photos.json   what is known of each source, by name, size and time of change
 
-HEIC needs pillow-heif (extra ``heic``). Nothing here changes the folder that was given.
+Nothing here changes the folder that was given.
 """
 
 from __future__ import annotations
 
-import hashlib
-import importlib
-import importlib.util
-import io
-import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
-
-from refield.photos import video
-from refield.photos.lens import Lens, read_lens
-from refield.photos.look import Look, look_at, usual_sharpness
+from refield.photos.lens import Lens
+from refield.photos.look import Look, usual_sharpness
 from refield.photos.sources import Source, find_sources
-from refield.scene import images
+from refield.photos.taken import FOLDER, PhotoConfig, Taken, from_picture, from_video, need_heif, stamp
 from refield.scene.errors import InputError
-from refield.scene.files import read_json, write_bytes, write_json
+from refield.scene.files import read_json, write_json
 
 OnProgress = Callable[[int, int], None]
-INDEX, FOLDER = "photos.json", "photos"
+INDEX = "photos.json"
 _KEEP_EVERY = 25  # sources between two writes of the index
-_AS_THEY_ARE = (".jpg", ".jpeg", ".png")
-
-
-@dataclass(frozen=True)
-class PhotoConfig:
-    """How photos without poses are taken in."""
-
-    longest: int = 1600
-    """pixels of the longer side; larger photos are scaled down to it"""
-    video_frames: int = 120
-    """taken from a video: the sharpest, spread over its length"""
-
-    def __post_init__(self) -> None:
-        for name, least in (("longest", 64), ("video_frames", 2)):
-            if getattr(self, name) < least:
-                remedy = f"give at least {least}"
-                raise InputError(f"--photos.{name.replace('_', '-')}", f"is {getattr(self, name)}", remedy)
-
-
-@dataclass(frozen=True)
-class Taken:
-    """A photo made ready."""
-
-    name: str
-    """how the user knows it"""
-    path: Path
-    """the upright copy"""
-    key: str
-    """its name in the cache, by its content"""
-    width: int
-    height: int
-    lens: Lens
-    look: Look
 
 
 @dataclass(frozen=True)
@@ -78,7 +36,7 @@ class Gathered:
 def gather(
     folder: Path,
     cache: Path,
-    config: PhotoConfig = PhotoConfig(),
+    config: PhotoConfig | None = None,
     on_progress: OnProgress | None = None,
     *,
     among: bool = True,
@@ -91,8 +49,9 @@ def gather(
     Raises:
         InputError: there are none, or HEIC files and nothing that reads them.
     """
+    config = config or PhotoConfig()
     sources = find_sources(folder)
-    _need_heif([s for s in sources if s.kind == "heic"])
+    need_heif([s for s in sources if s.kind == "heic"])
     known = _read_index(cache, config)
     records: dict[str, Any] = {}
     for i, source in enumerate(sources):
@@ -102,18 +61,6 @@ def gather(
         if on_progress is not None:
             on_progress(i + 1, len(sources))
     return _sorted_out(cache, records, among)
-
-
-def pixels_of(photo: Taken) -> np.ndarray:
-    """(H, W, 3) uint8."""
-    return np.asarray(images.read_image(photo.path).numpy())
-
-
-def _need_heif(sources: Sequence[Source]) -> None:
-    if sources and importlib.util.find_spec("pillow_heif") is None:
-        more = f" (and {len(sources) - 1} more files)" if len(sources) > 1 else ""
-        what = f"is HEIC{more}, which needs the package pillow-heif"
-        raise InputError(sources[0].path, what, "pip install 'refield[heic]', or convert to JPEG")
 
 
 def _read_index(cache: Path, config: PhotoConfig) -> dict[str, Any]:
@@ -126,14 +73,9 @@ def _read_index(cache: Path, config: PhotoConfig) -> dict[str, Any]:
     return photos if data.get("config") == asdict(config) and isinstance(photos, dict) else {}
 
 
-def _stamp(source: Source) -> list[int]:
-    stat = source.path.stat()
-    return [stat.st_size, stat.st_mtime_ns]
-
-
 def _fresh(cache: Path, source: Source, known: dict[str, Any]) -> dict[str, Any] | None:
     record = known.get(source.name)
-    if not isinstance(record, dict) or record.get("stamp") != _stamp(source):
+    if not isinstance(record, dict) or record.get("stamp") != stamp(source):
         return None
     try:
         there = all(_taken(cache, p).path.is_file() for p in record["photos"])
@@ -143,61 +85,15 @@ def _fresh(cache: Path, source: Source, known: dict[str, Any]) -> dict[str, Any]
 
 
 def _made(cache: Path, source: Source, config: PhotoConfig) -> dict[str, Any]:
-    record: dict[str, Any] = {"stamp": _stamp(source), "photos": [], "fault": ""}
+    record: dict[str, Any] = {"stamp": stamp(source), "photos": [], "fault": ""}
     try:
         if source.kind == "video":
-            record["photos"] = [_record(p) for p in _from_video(cache, source, config)]
+            record["photos"] = [_record(p) for p in from_video(cache, source, config)]
         else:
-            record["photos"] = [_record(_from_picture(cache, source, config))]
+            record["photos"] = [_record(from_picture(cache, source, config))]
     except InputError as error:
         record["fault"] = error.what
     return record
-
-
-def _from_picture(cache: Path, source: Source, config: PhotoConfig) -> Taken:
-    formats: Sequence[str] = images.FORMATS
-    if source.kind == "heic":
-        importlib.import_module("pillow_heif").register_heif_opener()
-        formats = ("HEIF",)
-    digest = hashlib.sha256(source.path.read_bytes()).hexdigest()[:16]
-    with images.opened(source.path, formats=formats) as image:
-        lens = read_lens(image)
-        as_it_is = not images.is_turned(image) and max(image.size) <= config.longest
-        upright = images.upright_rgb(source.path, image)
-    target = cache / FOLDER / f"{digest}.jpg"
-    if as_it_is and source.path.suffix.lower() in _AS_THEY_ARE:
-        target = target.with_suffix(source.path.suffix.lower())
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source.path, target)
-    else:
-        upright = _scaled(upright, config.longest)
-        _write_jpeg(target, upright)
-    return Taken(source.name, target, target.name, *upright.size, lens, look_at(np.asarray(upright)))
-
-
-def _from_video(cache: Path, source: Source, config: PhotoConfig) -> Iterator[Taken]:
-    stat = _stamp(source)
-    digest = hashlib.sha256(f"{source.path.resolve()} {stat}".encode()).hexdigest()[:12]
-    for i, (seconds, frame) in enumerate(video.sharp_frames(source.path, config.video_frames)):
-        picture = _scaled(Image.fromarray(frame), config.longest)
-        target = cache / FOLDER / f"{digest}{i:04d}.jpg"
-        _write_jpeg(target, picture)
-        name, look = f"{source.name} at {seconds:.2f} s", look_at(np.asarray(picture))
-        yield Taken(name, target, target.name, *picture.size, Lens(), look)
-
-
-def _scaled(image: Image.Image, longest: int) -> Image.Image:
-    scale = longest / max(image.size)
-    if scale >= 1:
-        return image
-    width, height = (max(round(side * scale), 1) for side in image.size)
-    return image.resize((width, height), Image.Resampling.LANCZOS, reducing_gap=3.0)
-
-
-def _write_jpeg(path: Path, image: Image.Image) -> None:
-    buffer = io.BytesIO()
-    image.save(buffer, "JPEG", quality=95, subsampling=0)
-    write_bytes(path, buffer.getvalue(), durable=False)
 
 
 def _record(photo: Taken) -> dict[str, Any]:

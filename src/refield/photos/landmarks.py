@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from refield.photos.database import Database
-from refield.photos.gather import Taken
 from refield.photos.lens import Lens
 from refield.photos.look import Look, look_at, usual_sharpness
 from refield.photos.motion import Counting, MotionConfig, globals_of, pairs_of, words_of
+from refield.photos.taken import Taken
 from refield.scene.capture import Capture
 from refield.scene.colmap import colmap_camera, quiet_pycolmap
 from refield.scene.errors import InputError

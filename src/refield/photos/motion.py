@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from refield.photos.database import Database, Pair, all_pairs, likely_pairs
-from refield.photos.gather import OnProgress, Taken
+from refield.photos.gather import OnProgress
 from refield.photos.lens import Lens
+from refield.photos.taken import Taken
 from refield.scene.capture import Capture, Frame
 from refield.scene.colmap import camera_of, points_of, quiet_pycolmap, world_from_cam_of
 from refield.scene.errors import InputError
