@@ -28,8 +28,8 @@ from refield.scene.world import World, world_of
 FEW, TOO_FEW = 30, 3
 _SPREAD = 1.0  # stops, from which on exposure is spoken of
 _GAP, _SEEN = 120.0, 3.0
-_SIFT_HERE = 1.3  # seconds a megapixel, on the machine that the rest was measured on: 2 cores of a Xeon
-_PER_PAIR, _PER_POSE, _PER_STEP = 0.08, 0.3, 0.0085  # seconds there
+_SIFT_HERE = 1.1  # seconds a megapixel, on the machine that the rest was measured on: 2 cores of a Xeon
+_PER_PAIR, _PER_POSE, _PER_STEP = 0.035, 0.12, 0.0085  # seconds there
 
 
 @dataclass(frozen=True)

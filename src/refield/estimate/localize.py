@@ -28,13 +28,15 @@ from refield.scene.images import read_image
 from refield.vision.describer import Describer
 from refield.vision.sift import Features, match_landmarks, unit
 
+_FURTHER = 5
+
 
 @dataclass(frozen=True)
 class LocalizeConfig:
     """How new photos without poses are placed."""
 
     similar: int = 12
-    """old photos that a new one is matched with; all of them if these do not suffice"""
+    """old photos that a new one is matched with; five times as many if these do not suffice"""
     features: int = 3000
     """SIFT features a photo"""
     ratio: float = 0.85
@@ -136,7 +138,7 @@ def _localized(photo: Taken, known: Known, config: LocalizeConfig) -> PlacedPhot
     first = _placed(photo, features, units, alike[: config.similar], known, config)
     if first.status == "used" or len(alike) <= config.similar:
         return first
-    return _placed(photo, features, units, alike, known, config)
+    return _placed(photo, features, units, alike[: _FURTHER * config.similar], known, config)
 
 
 def _alike(image: NDArray[np.uint8], units: Tensor, known: Known) -> Tensor:

@@ -7,6 +7,7 @@ Letters: P points, M observations of them, F frames, D length of a frame's vecto
 
 from __future__ import annotations
 
+import hashlib
 import json
 import tempfile
 from collections.abc import Sequence
@@ -176,7 +177,10 @@ def _as_taken(capture: Capture) -> list[Taken]:
     for i, frame in enumerate(capture.frames):
         look: Look = look_at(read_image(frame.path).numpy())
         camera = frame.camera
-        out.append(Taken(frame.name, frame.path, f"{i:05d}", camera.width, camera.height, Lens(), look))
+        digest = hashlib.sha256(frame.path.read_bytes()).hexdigest()[
+            :16
+        ]  # by content: the cache may be of other photos
+        out.append(Taken(frame.name, frame.path, f"{digest}-{i}", camera.width, camera.height, Lens(), look))
     return out
 
 
