@@ -51,7 +51,7 @@ def load_new_photos(photos: Path, capture: Capture, *, warn: Warn = log_warning)
     if not photos.exists():
         raise InputError(photos, "there is no such file or folder", "give the folder of the new photos")
     if photos.is_dir() and not (photos / transforms_json.NAME).is_file():
-        give = "a transforms.json with their poses in the capture's world"
+        give = "a transforms.json with their poses in the capture's world, or the photos alone"
         if colmap.find_models(photos):
             raise InputError(photos, "holds a COLMAP model, which is read for first photos only", f"give {give}")
         raise _unposed(photos, give, "localize_photos")
