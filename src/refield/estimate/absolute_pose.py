@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.estimate.intrinsics import Guess
+from refield.estimate.own_camera import ENOUGH, refined
 from refield.scene.camera import Camera
 from refield.scene.colmap import camera_of, colmap_camera, quiet_pycolmap
 from refield.scene.errors import InputError
@@ -22,6 +23,7 @@ _CELLS = 8  # a side, that the picture is divided into to see how far inliers sp
 _RIVAL = 0.5  # of the inliers: a second pose with so many is looked at
 _OWN_GAIN = 1.2  # times the inliers that a camera of its own must have to be preferred to the old photos'
 _FEW = 6
+_ROUNDS = 3  # of refining a camera of its own: each finds more inliers
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,16 @@ def _ransac(xy: _F64, xyz: _F64, guess: Guess, most_error: float) -> Solved | No
         used = camera_of(camera, "a new photo") if guess.refine else guess.camera
     except InputError:  # refined into what is no camera: a few wrong matches can do that
         return None
-    return _judged(xy, xyz, (pose, used, guess.how), most_error)
+    best = _judged(xy, xyz, (pose, used, guess.how), most_error)
+    for _ in range(_ROUNDS if guess.search else 0):
+        if best is None or best.count < ENOUGH:
+            break
+        pose, used = refined(best.world_from_cam, best.camera, xy[best.inliers], xyz[best.inliers])
+        again = _judged(xy, xyz, (pose, used, guess.how), most_error)
+        if again is None or again.count < best.count:
+            break
+        best = again
+    return best
 
 
 def _camera(pycolmap: Any, guess: Guess) -> Any:
