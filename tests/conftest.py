@@ -8,6 +8,7 @@ import pytest
 
 from refield.cli import main
 from tests.captures import write_capture
+from tests.photos.reconstructed import reconstructed as reconstructed
 
 TINY_FIT = ["--fit.steps", "60", "--fit.samples", "2048", "--fit.field.levels", "2"]
 TINY_FIT += ["--fit.field.log2-table", "8", "--fit.field.width", "8"]

@@ -1,11 +1,13 @@
 """The commands join the stages: what they write, print and return."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,8 +16,10 @@ from safetensors.torch import save_file
 from refield.cli import COMMANDS, main
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
 from refield.scene.images import read_image, write_image
+from refield.workspace import Workspace
 from tests.conftest import HERE, TINY_FIT
 from tests.folders import contents
+from tests.photos.room import write_photos
 from tests.vision.test_perceptual import channels_of, filled, network_of
 
 update = pytest.importorskip("refield.commands.update")
@@ -94,7 +98,7 @@ def test_evaluate_with_lpips(place, capsys):
 def believing(monkeypatch, *kinds):
     """Let the estimate say that an object of each kind changed in the middle of the scene."""
 
-    def estimate(capture, field, frames, config, on_stage=None, known=()):
+    def estimate(capture, field, frames, config, on_stage=None, models=None, known=()):
         for name in ("look", "decide"):
             on_stage(name)
         grid = OccupancyGrid(torch.tensor([[-0.3, -0.3, -0.3], [0.3, 0.3, 0.3]]), torch.ones(5, 5, 5))
@@ -198,7 +202,7 @@ def test_an_update_that_does_harm_is_not_kept(place, monkeypatch, capsys):
 
 
 def test_no_usable_photo(place, monkeypatch, capsys):
-    def estimate(capture, field, frames, config, on_stage=None, known=()):
+    def estimate(capture, field, frames, config, on_stage=None, models=None, known=()):
         return SceneChange(photos=tuple(PlacedPhoto(f.name, "rejected", "98 % changed") for f in frames))
 
     monkeypatch.setattr(update, "estimate_change", estimate)
@@ -328,3 +332,37 @@ def test_a_killed_update_leaves_the_workspace_as_it_was_or_complete(place, monke
     believing(monkeypatch, "removed")
     assert main(["update", "work", "new", *FEW]) == 0  # and clears away what the killed one left
     assert not list(place.glob("work/**/.part-*"))
+
+
+def test_photos_alone_all_the_way(reconstructed, tmp_path, monkeypatch, capsys):
+    """Train from photos, update from photos: placed ones are compared, one that is black is kept as rejected."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(reconstructed.folder / "photos", "before")
+    shutil.copytree(reconstructed.folder / "cache", "work/.photos")
+    assert main(["train", "before", "work", "--scale", "0.5", "--poses.motion.features", "500", *TINY_FIT]) == 0
+    assert "8 of 8 photos placed" in capsys.readouterr().err
+    workspace = Workspace.open(Path("work"))
+    assert workspace.world().metres_per_unit == 0.5 and workspace.landmarks.is_file()
+
+    write_photos(Path("elsewhere"), 2, seed=7)
+    before = contents(Path("work"))
+    assert main(["update", "work", "elsewhere", "--localize.features", "500"]) == 2
+    said = capsys.readouterr().err
+    assert re.search(r"elsewhere: none of its 2 photos can be placed \(0.png cannot be placed", said)
+    assert contents(Path("work")) == before
+
+    write_photos(Path("after"), 2, turn=0.5)
+    write_image(Path("after/black.png"), torch.zeros(150, 200, 3))
+    monkeypatch.setattr(update, "estimate_change", believe_photos)
+    assert main(["update", "work", "after", "--localize.features", "500"]) == 0
+    assert "left out: black.png is black" in capsys.readouterr().err
+    told = json.loads(Path("work/visits/001/change.json").read_text())["photos"]
+    assert [(p["file"], p["status"]) for p in told] == [("0.png", "used"), ("1.png", "used"), ("black.png", "rejected")]
+    assert told[0]["placement"]["inliers"] > 100 and "is black" in told[2]["why"]
+    page = Path("work/visits/001/report.html").read_text()
+    assert "black.png" in page and "points that agree" in page
+
+
+def believe_photos(capture, field, frames, config, on_stage=None, models=None, known=()):
+    """Nothing changed, and all photos were used."""
+    return SceneChange(photos=tuple(PlacedPhoto(f.name, "used", frame=f) for f in frames))

@@ -99,6 +99,11 @@ def foreign(place: Path) -> None:
         image.save(place / "foreign/000.png")
 
 
+def bare(place: Path) -> None:
+    """A folder with nothing in it."""
+    (place / "bare").mkdir()
+
+
 def nothing(place: Path) -> None:
     """The command line itself is wrong."""
 
@@ -114,8 +119,13 @@ FIELD = "work/field/field.safetensors"
 ROWS: dict[str, tuple[list[str], Callable[[Path], object], str]] = {
     # the command, how its input is spoilt, what the message must say
     "no data": (["train", "nowhere", "out"], nothing, r"nowhere: .*no such file"),
-    "empty data": (["train", ".", "out"], nothing, r"transforms\.json.*COLMAP"),
-    "photos without poses": (TRAIN, gone(DATA), r"12 photos but no camera poses"),
+    "empty data": (
+        ["train", "bare", "out"],
+        lambda place: (place / "bare").mkdir(),
+        r"no photos, no transforms\.json and no COLMAP",
+    ),
+    "folders of photos": (["check", "."], nothing, r"folders of photos \(data, new\); give one of them"),
+    "photos that do not match": (TRAIN, gone(DATA), r"12 photos .*images/000.png.*: no two photos of which.*overlap"),
     "not json": (TRAIN, text(DATA, "{"), r"transforms\.json: is not valid JSON"),
     "nested json": (TRAIN, text(DATA, "[" * 200_000), r"transforms\.json: is nested too deeply"),
     "key missing": (TRAIN, top(fl_x=None), r"frame 'images/000\.png': fl_x"),
@@ -151,7 +161,7 @@ ROWS: dict[str, tuple[list[str], Callable[[Path], object], str]] = {
     "field is damaged": (RENDER, half(FIELD), r"field\.safetensors: is damaged"),
     "capture is damaged": (UPDATE, gone("work/capture/transforms.json"), r"capture/transforms\.json"),
     "no new photos": (["update", "work", "nowhere"], nothing, r"nowhere: there is no such"),
-    "new photos without poses": (UPDATE, gone(NEW), r"4 photos but no camera poses"),
+    "new photos in nothing": (UPDATE, gone(NEW), r"only 0 points of its photos agree with their poses; check"),
     "new photo missing": (UPDATE, gone("new/images/001.png"), r"001\.png'.*no such image"),
     "new photo broken": (UPDATE, half("new/images/002.png"), r"002\.png: cannot be decoded"),
     "new photo is text": (UPDATE, text("new/images/002.png", "x"), r"002\.png: is not an image"),
@@ -177,7 +187,7 @@ ROWS: dict[str, tuple[list[str], Callable[[Path], object], str]] = {
     "unknown command": (
         ["trian", "data", "out"],
         nothing,
-        r"'trian' is no command; choose one of demo, train",
+        r"'trian' is no command; choose one of demo, check, train",
     ),
     "unknown world": (["synth", "moon", "out"], nothing, r"no such world; choose one of"),
 }

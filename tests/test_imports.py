@@ -13,13 +13,15 @@ MAY_IMPORT = {
     "vision": set(),
     "field": {"scene"},
     "synthetic": {"scene", "field"},
+    "photos": {"scene", "vision"},  # beside field: what is found here, estimate places new photos by
     "artefacts": {"scene"},
     "workspace": {"scene", "field", "artefacts"},
-    "estimate": {"scene", "field", "vision"},
+    "estimate": {"scene", "field", "vision", "photos"},
     "update": {"scene", "field", "vision", "artefacts"},
     "evaluate": {"scene", "field", "vision"},
     "report": {"scene", "field", "vision"},
     "baselines": {"scene", "field", "vision", "update"},  # learns from what the update's supervision leaves
+    "check": {"scene", "field", "vision", "photos"},
     "history": {"scene", "field", "update", "workspace", "artefacts"},
     "cli": {"scene", "commands"},
     "commands": None,  # joins everything

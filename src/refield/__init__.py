@@ -6,6 +6,8 @@
     change = refield.estimate_change(capture, field, photos)
     updated = refield.update_field(capture, field, change)
 
+Photos without poses: `capture_from_photos` in place of `load_capture`, `localize_photos` of `load_new_photos`.
+
 This is the table of contents; a name is imported when it is first used. Metrics are in `refield.evaluate`,
 the report page in `refield.report`.
 """
@@ -16,10 +18,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from refield.estimate.localize import known_by, localize_photos
     from refield.estimate.recipe import estimate_change
     from refield.field.fit import fit_field
     from refield.field.radiance import Field, HashField
     from refield.field.render import render_frame
+    from refield.photos.capture import capture_from_photos
     from refield.scene.capture import Capture, Frame
     from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
     from refield.scene.errors import InputError
@@ -42,10 +46,13 @@ __all__ = [
     "SceneChange",
     "UpdatedField",
     "Workspace",
+    "capture_from_photos",
     "estimate_change",
     "fit_field",
+    "known_by",
     "load_capture",
     "load_new_photos",
+    "localize_photos",
     "render_frame",
     "update_field",
     "write_image",
@@ -60,7 +67,9 @@ _HOME = {
     "field.fit": ("fit_field",),
     "field.radiance": ("Field", "HashField"),
     "field.render": ("render_frame",),
+    "estimate.localize": ("known_by", "localize_photos"),
     "estimate.recipe": ("estimate_change",),
+    "photos.capture": ("capture_from_photos",),
     "update.composite": ("UpdatedField",),
     "update.train": ("update_field",),
     "workspace": ("Workspace",),

@@ -17,7 +17,8 @@ from refield.scene.errors import InputError
 
 COMMANDS = {
     "demo": "sample capture → field → update → report; no downloads, on a CPU",
-    "train": "photos with camera poses → a field in a workspace",
+    "check": "looks photos over before any time is spent on them",
+    "train": "photos, with camera poses or without → a field in a workspace",
     "update": "a few new photos → what changed, and the field brought up to date",
     "visits": "what changed at each update of a workspace",
     "undo": "take the last update back",

@@ -1,6 +1,7 @@
 """The folder in which a field lives: capture, field, visits. Every artefact's place, each put there whole.
 
-    WORK/  refield.json   capture/{transforms.json,images/}   field/{field.safetensors,field.json}
+    WORK/  refield.json   capture/{transforms.json,images/,world.json,landmarks.safetensors}
+           field/{field.safetensors,field.json}
            visits/001/{change.json, grid_0.npz, masks/, photos/, field.safetensors, report.json, report.html}
 
 ``refield.json`` is written last and marks a complete workspace. New artefacts are built in ``.part-*`` and
@@ -35,11 +36,14 @@ from refield.scene.change_files import load_change, save_change
 from refield.scene.errors import InputError
 from refield.scene.files import read_json, write_json
 from refield.scene.transforms_json import load_transforms, save_transforms
+from refield.scene.world import World, world_of
 
 __all__ = ["Workspace", "load_change", "save_change"]
 
-MARKER = "refield.json"
+MARKER, WORLD = "refield.json", "world.json"
 FORMAT = 1
+CACHE = ".photos"
+"""what structure from motion has found, kept while it goes on and for the next time; may be deleted"""
 _OURS = (MARKER, "capture", "field", "visits")
 
 
@@ -108,6 +112,46 @@ class Workspace:
         finally:
             if not existed and not (path / MARKER).exists():
                 shutil.rmtree(path, ignore_errors=True)
+
+    @staticmethod
+    @contextlib.contextmanager
+    def caching(path: Path) -> Iterator[Path]:
+        """The folder, made if need be, in which a workspace that is to be made at ``path`` keeps what takes long.
+
+        Unlike the workspace it is there from the beginning, so that what was interrupted goes on.
+        """
+        existed = path.exists()
+        with writable(path):
+            (path / CACHE).mkdir(parents=True, exist_ok=True)
+        try:
+            with locked(path):
+                yield path / CACHE
+        finally:
+            if not any((path / CACHE).iterdir()):
+                (path / CACHE).rmdir()
+                if not existed:
+                    shutil.rmtree(path, ignore_errors=True)
+
+    @property
+    def cache(self) -> Path:
+        """As `caching`, of a workspace that is there; call under the lock."""
+        with writable(self.path):
+            (self.path / CACHE).mkdir(exist_ok=True)
+        return self.path / CACHE
+
+    @property
+    def landmarks(self) -> Path:
+        """The file of what new photos are placed by, which need not exist (`refield.photos.landmarks`)."""
+        return self.path / "capture" / "landmarks.safetensors"
+
+    def keep_world(self, world: World) -> None:
+        """Write what is known of the capture's world beside it."""
+        write_json(self.path / "capture" / WORLD, world.to_dict())
+
+    def world(self) -> World:
+        """What is known of the capture's world; found out anew where it was not written."""
+        path = self.path / "capture" / WORLD
+        return World.from_dict(read_json(path), path) if path.is_file() else world_of(self.capture())
 
     @staticmethod
     def made_by(path: Path) -> str | None:
@@ -234,7 +278,7 @@ def _photo_at(photo: PlacedPhoto, frame: Frame) -> PlacedPhoto:
 
 
 def _is_ours_hidden(path: Path) -> bool:
-    return path.name == LOCK or path.name.startswith(PART)
+    return path.name in (LOCK, CACHE) or path.name.startswith(PART)
 
 
 def _swap_in(path: Path, part: Path) -> None:

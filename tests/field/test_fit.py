@@ -18,6 +18,7 @@ from refield.field.fit import (
     FitConfig,
     FitProgress,
     NonFiniteError,
+    _Fit,
     fit_field,
     place_contraction,
     rate_factor,
@@ -85,6 +86,27 @@ def test_held_out_views_are_explained(capture: Capture, fitted: tuple[HashField,
     assert len(looks) >= 2 and looks[-1].rays_per_second > 0
     view = render_frame(field, capture.held_out[0])
     assert view.opacity.mean() > 0.9
+
+
+def test_a_fit_that_leads_nowhere_begins_anew(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    short = replace(TINY, steps=20, check_every=20, field=replace(TINY.field, levels=2, log2_table=8))
+    other = fit_field(capture, replace(short, seed=short.seed + 1))
+    asked: list[int] = []
+    monkeypatch.setattr(_Fit, "_stuck", lambda fit: asked.append(fit.steps_done) or (len(asked) == 5))
+    again = fit_field(capture, short)
+    assert asked == [1, 2, 3, 4, 5, *range(1, 21)]
+    assert all(torch.equal(a, b) for a, b in zip(again.parameters(), other.parameters()))
+    monkeypatch.setattr(_Fit, "_stuck", lambda fit: True)
+    fit_field(capture, short)  # the last attempt is kept, whatever it is
+
+
+def test_what_leads_nowhere(capture: Capture) -> None:
+    fit = object.__new__(_Fit)
+    for first, second, stuck in ((0.0135, 0.0115, True), (0.0135, 0.006, False), (0.004, 0.004, False)):
+        fit.steps_done, fit.loss = 250, first
+        assert not fit._stuck()
+        fit.steps_done, fit.loss = 500, second
+        assert fit._stuck() == stuck
 
 
 def test_same_seed_same_field(capture: Capture) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
+from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, Placement, SceneChange
 from refield.scene.change_files import load_change, save_change
 from refield.scene.errors import InputError
 from refield.scene.pose import exp
@@ -34,7 +34,8 @@ def change(tmp_path, capture):
     )
     new = write_capture(tmp_path / "visit" / "photos", 2, DISTORTED, turn=0.2)
     photos = tuple(PlacedPhoto(f"their/{f.name}", "used", "", replace(f, name=f"their/{f.name}")) for f in new.frames)
-    photos += (PlacedPhoto("blurred.png", "rejected", "7 inliers"),)
+    photos = (replace(photos[0], placement=Placement(120, 150, 0.4, "that of the old photos")), photos[1])
+    photos += (PlacedPhoto("blurred.png", "rejected", "7 inliers", placement=Placement(7, 90, 1.5)),)
     seen = (torch.rand(24, 32) > 0.5, torch.rand(24, 32) > 0.5)
     return SceneChange(objects, photos, "because", seen, seen[::-1])
 
@@ -43,6 +44,15 @@ def same(a, b):
     if isinstance(a, torch.Tensor):
         return torch.equal(a, b)
     return len(a) == len(b) and all(x is y is None or torch.equal(x, y) for x, y in zip(a, b))
+
+
+def test_photos_that_were_not_placed_join_those_that_were_compared(change):
+    compared = replace(change, photos=(replace(change.photos[0], placement=None, why="darker"), change.photos[1]))
+    placed = [change.photos[2], replace(change.photos[0], why=""), change.photos[1]]
+    joined = compared.among(placed)
+    assert [p.name for p in joined.photos] == [p.name for p in placed]
+    assert joined.photos[1].why == "darker" and joined.photos[1].placement == change.photos[0].placement
+    assert joined.frames == change.frames, "in the order of the masks"
 
 
 def test_round_trip(tmp_path, capture, change):
@@ -58,7 +68,7 @@ def test_round_trip(tmp_path, capture, change):
         for x, y in ((a.new_from_old, b.new_from_old), (a.covariance, b.covariance)):
             assert x is y is None or torch.equal(x, y)
     for a, b in zip(change.photos, back.photos, strict=True):
-        assert (a.name, a.status, a.why) == (b.name, b.status, b.why)
+        assert (a.name, a.status, a.why, a.placement) == (b.name, b.status, b.why, b.placement)
         if a.frame is not None:
             assert b.frame.path == a.frame.path.resolve() and b.frame.camera == a.frame.camera
             assert torch.equal(a.frame.world_from_cam, b.frame.world_from_cam)

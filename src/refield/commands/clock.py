@@ -77,6 +77,31 @@ class Clock:
             yield lambda done, total: progress.update(task, completed=done, total=total)
 
     @contextlib.contextmanager
+    def counters(self) -> Iterator[Callable[[str], Callable[[int, int], None]]]:
+        """Bars for several things that are counted one after the other, each by its name; off a terminal a line
+        every few seconds."""
+        with contextlib.ExitStack() as stack:
+
+            def count(what: str) -> Callable[[int, int], None]:
+                if self.console.is_terminal:
+                    stack.close()  # the one before it is done
+                    return stack.enter_context(self.counting(what))
+                return self._lines(what)
+
+            yield count
+
+    def _lines(self, what: str) -> Callable[[int, int], None]:
+        shown = time.perf_counter()
+
+        def tell(done: int, total: int) -> None:
+            nonlocal shown
+            if time.perf_counter() - shown > _QUIET_SECONDS:
+                shown = time.perf_counter()
+                self.console.print(f"           {what}: {done} of {total}", markup=False)
+
+        return tell
+
+    @contextlib.contextmanager
     def training(self, name: str) -> Iterator[TrainingLine]:
         """A progress line for a fit: a bar on a terminal, else a line every few seconds."""
         progress = Progress(

@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 from refield.commands.clock import Clock, results
 from refield.commands.evaluate import table
 from refield.commands.page import evaluation_views
-from refield.commands.train import train
+from refield.commands.train import Sources, train
 from refield.commands.update import Update, Visit, update
 from refield.evaluate import pose_error
 from refield.field.fit import FitConfig
@@ -37,10 +37,10 @@ def run(options: Demo) -> None:
     clock = Clock()
     sample = sample_folder()
     again = Workspace.made_by(options.out) == "demo"
-    psnr = train(sample / "before", options.out, clock, options.fit, overwrite=again, made_by="demo")
+    task = Sources(sample / "before", options.out)
+    psnr = train(task, clock, options.fit, overwrite=again, made_by="demo")
     facts = {} if math.isnan(psnr) else {"held-out PSNR of the field (dB)": round(psnr, 2)}
-    task = Update(options.out, sample / "after", evaluation=sample / "eval")
-    visit = update(task, clock, facts)
+    visit = update(Update(options.out, sample / "after", evaluation=sample / "eval"), clock, facts)
     sheet = options.out / "before-after.png"
     if visit.evaluation is not None:
         write_contact_sheet(sheet, evaluation_views(visit.evaluation))

@@ -1,8 +1,7 @@
-"""``refield train DATA WORK``: photos with poses → a field in a new workspace."""
+"""``refield train DATA WORK``: photos, with camera poses or without → a field in a new workspace."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -11,46 +10,68 @@ from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
 from refield.field.fit import FitConfig, NonFiniteError, fit_field
-from refield.field.memory import Memory, memory_of
+from refield.field.memory import Memory, memory_fault, memory_of
+from refield.photos.capture import FromPhotosConfig, capture_from_photos
+from refield.photos.landmarks import Landmarks, write_landmarks
 from refield.scene.capture import Capture, centres
 from refield.scene.errors import InputError
-from refield.scene.load import load_capture
+from refield.scene.load import is_posed, load_capture
+from refield.scene.world import world_of
 from refield.workspace import Workspace
 
 
 @dataclass(frozen=True)
 class Train:
-    """Fit a field to photos with known camera poses, and keep both in a new workspace."""
+    """Fit a field to photos, and keep both in a new workspace. Where no camera poses are given, they are found."""
 
     data: Annotated[Path, arg(metavar="DATA"), Positional]
-    """a transforms.json or its folder, or a folder with a COLMAP model in sparse/0 and images/"""
+    """a folder of photos or videos, a transforms.json or its folder, or a COLMAP model in sparse/0 with images/"""
     work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace to make"""
     overwrite: bool = False
     """replace the workspace that is there, with its visits"""
+    scale: float | None = None
+    """metres per unit of the world, if you know them: lengths are then told in metres too"""
+    poses: FromPhotosConfig = field(default_factory=FromPhotosConfig)
+    """photos without poses: how they are taken in, and how their poses are found"""
     fit: FitConfig = field(default_factory=FitConfig)
 
 
 def run(options: Train) -> None:
     clock = Clock()
-    train(options.data, options.work, clock, options.fit, overwrite=options.overwrite)
+    _check_scale(options.scale)
+    task = Sources(options.data, options.work, options.poses, options.scale)
+    train(task, clock, options.fit, overwrite=options.overwrite)
     clock.console.print(f"The field is in {options.work} ({clock.total:.1f} s).", markup=False)
 
 
-def train(data: Path, work: Path, clock: Clock, config: FitConfig, *, overwrite: bool, made_by: str = "train") -> float:
+@dataclass(frozen=True)
+class Sources:
+    """What a workspace is made from."""
+
+    data: Path
+    work: Path
+    poses: FromPhotosConfig = field(default_factory=FromPhotosConfig)
+    scale: float | None = None
+
+
+def train(task: Sources, clock: Clock, config: FitConfig, *, overwrite: bool, made_by: str = "train") -> float:
     """Load, fit, keep. Returns the PSNR on held-out pixels, dB (NaN where none is held out).
 
     Raises:
-        InputError: as `load_capture` and `Workspace.building`, or the photos do not fit into memory.
+        InputError: as `load_capture`, `capture_from_photos` and `Workspace.building`, or the photos do not fit into
+            memory.
     """
-    Workspace.refuse_unless_free(work, overwrite=overwrite)
-    clock.stage("load the capture")
-    capture = load_capture(data, warn=clock.warn)
+    Workspace.refuse_unless_free(task.work, overwrite=overwrite)
+    capture, landmarks = _loaded(task, clock)
     needed = memory_of(capture, config)
-    _check_memory(data, needed)
-    _check_cameras(data, capture)
-    with Workspace.building(work, overwrite=overwrite, made_by=made_by) as workspace:
+    _check_memory(task.data, needed)
+    _check_cameras(task.data, capture)
+    with Workspace.building(task.work, overwrite=overwrite, made_by=made_by) as workspace:
         capture = workspace.keep_capture(capture)
+        workspace.keep_world(world_of(capture, task.scale))
+        if landmarks is not None:
+            write_landmarks(workspace.landmarks, landmarks)
         clock.stage(f"fit a field to {len(capture.train)} photos")
         clock.console.print(f"           memory: {needed}", markup=False)
         try:
@@ -67,6 +88,23 @@ def train(data: Path, work: Path, clock: Clock, config: FitConfig, *, overwrite:
     return line.psnr
 
 
+def _loaded(task: Sources, clock: Clock) -> tuple[Capture, Landmarks | None]:
+    if is_posed(task.data):
+        clock.stage("load the capture")
+        return load_capture(task.data, warn=clock.warn), None
+    clock.stage("find where the photos were taken")
+    with Workspace.caching(task.work) as cache, clock.counters() as counting:
+        found = capture_from_photos(task.data, cache, task.poses, warn=clock.warn, counting=counting)
+    placed = f"{len(found.capture.frames)} of {found.photos} photos placed"
+    clock.console.print(f"           {placed}, {len(found.capture.points)} points", markup=False)
+    return found.capture, found.landmarks
+
+
+def _check_scale(scale: float | None) -> None:
+    if scale is not None and not 0 < scale < 1e6:
+        raise InputError("--scale", f"{scale:g} is no length", "give how many metres one unit of the world is")
+
+
 def _check_cameras(data: Path, capture: Capture) -> None:
     """Refuse photos that show nothing in depth."""
     at = centres(capture.frames)
@@ -78,8 +116,6 @@ def _check_cameras(data: Path, capture: Capture) -> None:
 
 def _check_memory(data: Path, needed: Memory) -> None:
     """Refuse what would not fit, with the number, before the machine starts to swap."""
-    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed.total > there / 2:
-        what = f"its photos take {needed.photos / 1e9:.1f} GB of memory, of which there are {there / 1e9:.1f}"
-        most = max((there / 2 - needed.total + needed.photos) / 1e9, 0.1)
-        raise InputError(data, what, f"give --fit.photo-memory {most:.1f} or less, or scale the photos down")
+    fault = memory_fault(needed)
+    if fault is not None:
+        raise InputError(data, *fault)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from refield.scene.errors import InputError
+from refield.vision.describer import Describer
 from refield.vision.matcher import Matcher, SiftMatcher
 from refield.vision.segmenter import GrabCutSegmenter, Segmenter
 
@@ -19,6 +20,8 @@ class Models:
     """image features, and masks from boxes with a confidence"""
     matcher: Matcher = field(default_factory=SiftMatcher)
     """corresponding points of two pictures"""
+    describer: Describer | None = None
+    """which old photos look like a new one; None: VLAD of the capture's own features. The paper: NetVLAD"""
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,10 @@ class ModelConfig:
     """finds corresponding points; all but sift need weights"""
     matcher_weights: Path | None = None
     """folder with config.json and *.safetensors"""
+    describer: Literal["vlad", "dinov2"] = "vlad"
+    """finds old photos that look like a new one without a pose; dinov2 needs weights"""
+    describer_weights: Path | None = None
+    """folder with config.json and *.safetensors"""
     device: Literal["cpu", "cuda"] = "cpu"
     """where models with weights run"""
 
@@ -42,9 +49,9 @@ class ModelConfig:
         Raises:
             InputError: weights are not given, or cannot be used.
         """
-        if self.segmenter == "grabcut" and self.matcher == "sift":
+        if (self.segmenter, self.matcher, self.describer) == ("grabcut", "sift", "vlad"):
             return Models()
-        from refield.vision.weights import MATCHERS, SEGMENTERS, WeightsError
+        from refield.vision.weights import DESCRIBERS, MATCHERS, SEGMENTERS, WeightsError
 
         def folder(kind: str, name: str, given: Path | None) -> Path:
             if given is None:
@@ -54,6 +61,7 @@ class ModelConfig:
 
         segmenter: Segmenter = GrabCutSegmenter()
         matcher: Matcher = SiftMatcher()
+        describer: Describer | None = None
         try:
             if self.segmenter != "grabcut":
                 where = folder("segmenter", self.segmenter, self.segmenter_weights)
@@ -61,6 +69,9 @@ class ModelConfig:
             if self.matcher != "sift":
                 where = folder("matcher", self.matcher, self.matcher_weights)
                 matcher = MATCHERS[self.matcher](where, self.device)
+            if self.describer != "vlad":
+                where = folder("describer", self.describer, self.describer_weights)
+                describer = DESCRIBERS[self.describer](where, self.device)
         except WeightsError as error:
             raise InputError(error.folder, error.what, error.remedy) from error
-        return Models(segmenter, matcher)
+        return Models(segmenter, matcher, describer)

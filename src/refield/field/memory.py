@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 from refield.field.fit import FitConfig, most_pixels
@@ -47,6 +48,21 @@ def memory_of(capture: Capture, config: FitConfig) -> Memory:
     sample = 3 * 8 * shape.levels + 40
     work = CHUNK * _ROOM * (8 * shape.levels + 28) + 2 * config.samples * sample
     return Memory(photos, distinct if distinct <= DIRECTIONS_MOST else 0, 4 * tables + cells, work)
+
+
+def memory_fault(needed: Memory) -> tuple[str, str] | None:
+    """What is wrong and what to do, where a fit would take more than half of the machine's memory; else None."""
+    there = machine_memory()
+    if needed.total <= there / 2:
+        return None
+    what = f"its photos take {needed.photos / 1e9:.1f} GB of memory, of which there are {there / 1e9:.1f}"
+    most = max((there / 2 - needed.total + needed.photos) / 1e9, 0.1)
+    return what, f"give --fit.photo-memory {most:.1f} or less, or scale the photos down"
+
+
+def machine_memory() -> int:
+    """Bytes that this machine has."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _short(n: int) -> str:

@@ -10,7 +10,7 @@ from html import escape
 from importlib import resources
 
 from refield.report.pictures import data_uri, with_masks
-from refield.report.tables import bars, chips, objects_table, scores_table
+from refield.report.tables import bars, chips, objects_table, placements_table, scores_table
 from refield.report.visit import Comparison, VisitReport, summary
 
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
@@ -44,7 +44,7 @@ def _parts(report: VisitReport) -> Iterable[str]:
     yield _header(report)
     yield _warnings(report.warnings)
     yield _slider(report)
-    yield _section("What changed", objects_table(report.change.objects))
+    yield _section("What changed", objects_table(report.change.objects, report.world))
     yield _section("New photos", _photos(report))
     yield _section("Views that took no part in the update", _views(report.evaluation_views, "truth"))
     if report.evaluation is not None:
@@ -85,6 +85,7 @@ def _photos(report: VisitReport) -> str:
     """Used photos with their pictures, rejected ones with the reason."""
     rejected = {p.name: p.why for p in report.change.photos if p.status == "rejected"}
     shown = _views([v for v in report.photos if v.name not in rejected], "new photo")
+    shown += placements_table(report.change.photos)
     if not rejected:
         return shown
     items = "".join(f"<li>{escape(n)}: {escape(why or 'no reason given')}</li>" for n, why in rejected.items())

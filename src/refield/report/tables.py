@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from refield.report.visit import VisitReport, object_shift, turn, uncertainty
-from refield.scene.change import ObjectChange
+from refield.report.visit import VisitReport, lengths, object_shift, turn, uncertainty
+from refield.scene.change import ObjectChange, PlacedPhoto
+from refield.scene.world import World
 
 _SCORES = {  # key of `refield.evaluate.Scores` -> heading, decimals
     "psnr_in": ("PSNR in", 2),
@@ -33,27 +34,48 @@ def chips(report: VisitReport) -> str:
     return f'<ul class="chips">{items}</ul>' if items else ""
 
 
-def objects_table(objects: Sequence[ObjectChange]) -> str:
-    """One row per object; lengths in the world's own units."""
+def objects_table(objects: Sequence[ObjectChange], world: World | None = None) -> str:
+    """One row per object; lengths in the world's own units, as a part of the scene, and in metres if known."""
     if not objects:
         return ""
-    rows = "".join(_object_row(i, o) for i, o in enumerate(objects))
+    rows = "".join(_object_row(i, o, world) for i, o in enumerate(objects))
     heads = ("", "kind", "its centre moved by", "and turned by", "uncertainty (1 σ)", "confidence", "note")
-    return _table(heads, rows) + '<p class="lead"><small>Lengths in the units of the capture.</small></p>'
+    scene = "" if world is None else f" The scene is {_number(world.size)} from camera to outermost camera."
+    return _table(heads, rows) + f'<p class="lead"><small>Lengths in the units of the capture.{scene}</small></p>'
 
 
-def _object_row(index: int, o: ObjectChange) -> str:
+def placements_table(photos: Sequence[PlacedPhoto]) -> str:
+    """How well photos that came without poses were placed; empty if all came with theirs."""
+    rows = "".join(
+        f'<tr><td>{escape(p.name)}</td><td class="n">{p.placement.inliers} of {p.placement.matches}</td>'
+        f'<td class="n">{p.placement.error:.2f}</td><td>{escape(p.placement.camera)}</td></tr>'
+        for p in photos
+        if p.placement is not None and p.frame is not None
+    )
+    return _table(("photo", "points that agree", "error, px", "camera"), rows) if rows else ""
+
+
+def _object_row(index: int, o: ObjectChange, world: World | None) -> str:
     shift, sure = object_shift(o), uncertainty(o)
     moved = turned = spread = "–"
     if o.new_from_old is not None and shift is not None:
         angle, axis = turn(o.new_from_old)
-        moved = f"{_number(math.hypot(*shift))} <small>({', '.join(_number(v) for v in shift)})</small>"
+        units = math.hypot(*shift)
+        along = f"<small>({', '.join(_number(v) for v in shift)})</small>"
+        moved = f"{_number(units)}{_told_lengths(units, world)} {along}"
         about = f" <small>about ({', '.join(f'{v:.2f}' for v in axis)})</small>" if any(axis) else ""
         turned = f"{angle:.2f}°{about}"
     if sure is not None:
         spread = f"{_number(sure[0])}, {f'{sure[1]:.2f}°' if sure[1] < 180 else 'any turn'}"
     cells = (f'<span class="kind {o.kind}">{o.kind}</span>', moved, turned, spread, f"{o.confidence:.2f}")
     return f"<tr><td>{index}</td>{''.join(f'<td>{c}</td>' for c in cells)}<td>{escape(o.note)}</td></tr>"
+
+
+def _told_lengths(units: float, world: World | None) -> str:
+    part, metres = lengths(units, world)
+    told = [] if part is None else [f"{100 * part:.1f} % of the scene"]
+    told += [] if metres is None else [f"{_number(metres)} m"]
+    return f" = {', '.join(told)}" if told else ""
 
 
 def scores_table(evaluation: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ import math
 import platform
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any
@@ -14,8 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from refield.scene.change import ObjectChange, SceneChange
+from refield.scene.change import ObjectChange, PlacedPhoto, SceneChange
 from refield.scene.pose import rotation_log, skew, transform
+from refield.scene.world import World
 
 _VERSIONS_OF = ("refield", "torch", "numpy", "numba", "opencv-python-headless", "pycolmap")
 
@@ -72,6 +73,8 @@ class VisitReport:
     """further numbers worth a line each, such as the field's PSNR on held-out frames"""
     warnings: tuple[str, ...] = ()
     """what the user should know"""
+    world: World | None = None
+    """how large the scene is, and a unit; lengths are then told as a part of the scene, and in metres"""
     versions: Mapping[str, str] = field(default_factory=versions)
     """of Python and the packages"""
 
@@ -134,8 +137,9 @@ def visit_report_dict(report: VisitReport) -> dict[str, Any]:
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "summary": summary(report.change),
         "why": report.change.why,
-        "objects": [_object_dict(o) for o in report.change.objects],
-        "photos": [{"file": p.name, "status": p.status, "why": p.why} for p in report.change.photos],
+        "world": None if report.world is None else report.world.to_dict(),
+        "objects": [_object_dict(o, report.world) for o in report.change.objects],
+        "photos": [_photo_dict(p) for p in report.change.photos],
         "warnings": list(report.warnings),
         "facts": {k: finite(v) for k, v in report.facts.items()},
         "seconds": {k: finite(v) for k, v in report.seconds.items()},
@@ -149,13 +153,30 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _object_dict(o: ObjectChange) -> dict[str, Any]:
+def lengths(units: float, world: World | None) -> tuple[float | None, float | None]:
+    """A length in the world's units as a part of the scene's size, and in metres; None where that is not known."""
+    if world is None:
+        return None, None
+    part = units / world.size if world.size > 0 else None
+    return part, None if world.metres_per_unit is None else units * world.metres_per_unit
+
+
+def _photo_dict(photo: PlacedPhoto) -> dict[str, Any]:
+    told: dict[str, Any] = {"file": photo.name, "status": photo.status, "why": photo.why}
+    return told if photo.placement is None else told | {"placement": asdict(photo.placement)}
+
+
+def _object_dict(o: ObjectChange, world: World | None) -> dict[str, Any]:
     sure = uncertainty(o)
+    shift = object_shift(o)
+    part, metres = (None, None) if shift is None else lengths(math.hypot(*shift), world)
     return {
         "kind": o.kind,
         "aabb": o.grid.tight_aabb().tolist(),
         "new_from_old": None if o.new_from_old is None else o.new_from_old.tolist(),
-        "shift": object_shift(o),
+        "shift": shift,
+        "shift_of_scene": part,
+        "shift_metres": metres,
         "angle_deg": None if o.new_from_old is None else turn(o.new_from_old)[0],
         "axis": None if o.new_from_old is None else turn(o.new_from_old)[1],
         "std_shift": None if sure is None else finite(sure[0]),

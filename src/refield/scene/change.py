@@ -6,6 +6,7 @@ An object is an occupancy grid (§4.2.4) in the world, a kind, and for a moved o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -135,6 +136,20 @@ class ObjectChange:
 
 
 @dataclass(frozen=True)
+class Placement:
+    """How well a photo's pose is known from the points that it shows (§4.2.1)."""
+
+    inliers: int
+    """points that agree with the pose"""
+    matches: int
+    """points that were recognised"""
+    error: float
+    """median distance of the inliers from where the pose puts them, pixels"""
+    camera: str = ""
+    """where its intrinsics come from"""
+
+
+@dataclass(frozen=True)
 class PlacedPhoto:
     """What became of one new photo."""
 
@@ -142,6 +157,8 @@ class PlacedPhoto:
     status: Literal["used", "rejected"]
     why: str = ""
     frame: Frame | None = None
+    placement: Placement | None = None
+    """None where the pose was given"""
 
     def __post_init__(self) -> None:
         if (self.status == "used") != (self.frame is not None):
@@ -167,3 +184,12 @@ class SceneChange:
     def frames(self) -> tuple[Frame, ...]:
         """The new photos that are used, with their poses."""
         return tuple(p.frame for p in self.photos if p.frame is not None)
+
+    def among(self, placed: Sequence[PlacedPhoto]) -> SceneChange:
+        """The same, with what localization said of all ``placed`` photos, of which the used ones were compared."""
+        verdicts = {photo.name: photo for photo in self.photos}
+        photos = [
+            replace(verdicts[p.name], placement=p.placement) if p.name in verdicts and p.frame is not None else p
+            for p in placed
+        ]
+        return replace(self, photos=tuple(photos))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from refield.scene import images
 from refield.scene.capture import Capture, Frame
-from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
+from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, Placement, SceneChange
 from refield.scene.errors import InputError
 from refield.scene.files import inside, read_json, write_bytes, write_json
 from refield.scene.intrinsics import read_camera, write_camera
@@ -117,6 +118,8 @@ def _check_masks(folder: Path, o: ObjectChange, frames: Sequence[Frame]) -> None
 
 def _photo_out(folder: Path, photo: PlacedPhoto) -> dict[str, Any]:
     record: dict[str, Any] = {"file": photo.name, "status": photo.status, "why": photo.why}
+    if photo.placement is not None:
+        record["placement"] = asdict(photo.placement)
     frame = photo.frame
     if frame is None:
         return record | {"world_from_cam": None}
@@ -128,10 +131,11 @@ def _photo_out(folder: Path, photo: PlacedPhoto) -> dict[str, Any]:
 
 def _photo_in(folder: Path, record: dict[str, Any], known: dict[str, Frame]) -> PlacedPhoto:
     name, status = str(record["file"]), record["status"]
+    placement = _placement(record.get("placement"))
     if status not in ("used", "rejected"):
         raise ValueError(f"the photo status {status!r}")
     if status == "rejected":
-        return PlacedPhoto(name, "rejected", str(record.get("why", "")))
+        return PlacedPhoto(name, "rejected", str(record.get("why", "")), placement=placement)
     where = f"{folder / NAME}: photo {name!r}"
     pose = _matrix(record["world_from_cam"], 4)
     image = record.get("image")
@@ -140,7 +144,14 @@ def _photo_in(folder: Path, record: dict[str, Any], known: dict[str, Frame]) -> 
     else:
         path = inside(folder, image, where) if image is not None else folder / name
         frame = Frame(path, read_camera(record["camera"], where, None), name, pose)
-    return PlacedPhoto(name, "used", str(record.get("why", "")), frame)
+    return PlacedPhoto(name, "used", str(record.get("why", "")), frame, placement)
+
+
+def _placement(record: dict[str, Any] | None) -> Placement | None:
+    if record is None:
+        return None
+    inliers, matches = int(record["inliers"]), int(record["matches"])
+    return Placement(inliers, matches, float(record["error"]), str(record.get("camera", "")))
 
 
 def _masks_out(folder: Path, prefix: str, masks: Sequence[Tensor | None]) -> list[str | None]:

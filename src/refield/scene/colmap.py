@@ -51,14 +51,14 @@ def load_colmap(folder: Path, *, images_folder: Path | None = None, warn: Warn =
     registered = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     for image in registered:
         where = f"{model_path}: image {image.name!r}"
-        camera = _camera(model.cameras[image.camera_id], where)
+        camera = camera_of(model.cameras[image.camera_id], where)
         path = inside(root, image.name, where)
         size = left_out.size_of(path, image.name)
         if size is not None:
-            frames.append(Frame(path, fitted(camera, size, where), image.name, _world_from_cam(image)))
+            frames.append(Frame(path, fitted(camera, size, where), image.name, world_from_cam_of(image)))
     left_out.report(model_path, len(registered), warn)
     _report_rescaled(model_path, model, frames, warn)
-    return Capture(tuple(frames), points=_points(model))
+    return Capture(tuple(frames), points=points_of(model))
 
 
 def save_colmap(folder: Path, capture: Capture, *, text: bool = False) -> None:
@@ -67,13 +67,15 @@ def save_colmap(folder: Path, capture: Capture, *, text: bool = False) -> None:
     Raises:
         ValueError: a camera has k3, which COLMAP's OPENCV model lacks.
     """
-    pycolmap = _pycolmap()
+    pycolmap = quiet_pycolmap()
+    if any(frame.camera.k3 for frame in capture.frames):
+        raise ValueError("COLMAP's OPENCV camera has no k3")
     model = pycolmap.Reconstruction()
     known: dict[Camera, int] = {}
     for index, frame in enumerate(capture.frames, start=1):
         if frame.camera not in known:
             known[frame.camera] = len(known) + 1
-            model.add_camera_with_trivial_rig(_colmap_camera(pycolmap, frame.camera, known[frame.camera]))
+            model.add_camera_with_trivial_rig(colmap_camera(pycolmap, frame.camera, known[frame.camera]))
         image = pycolmap.Image(name=frame.path.name, camera_id=known[frame.camera], image_id=index)
         pose = invert(frame.world_from_cam)[:3].numpy()
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.ascontiguousarray(pose)))
@@ -83,7 +85,7 @@ def save_colmap(folder: Path, capture: Capture, *, text: bool = False) -> None:
     (model.write_text if text else model.write)(str(folder))
 
 
-def _pycolmap() -> Any:
+def quiet_pycolmap() -> Any:
     """The module, quiet, and without the handler of SIGTERM that it installs: it would kill before we clear up."""
     import pycolmap
 
@@ -95,7 +97,7 @@ def _pycolmap() -> Any:
 
 def _largest(folder: Path, warn: Warn) -> tuple[Path, Any]:
     """The model with the most registered images, and its folder."""
-    pycolmap = _pycolmap()
+    pycolmap = quiet_pycolmap()
     models = []
     for path in find_models(folder):
         try:
@@ -122,7 +124,12 @@ def _images_folder(folder: Path, model_path: Path) -> Path:
     return folder
 
 
-def _camera(camera: Any, where: str) -> Camera:
+def camera_of(camera: Any, where: str) -> Camera:
+    """A COLMAP camera as ours.
+
+    Raises:
+        InputError: its model is not supported, or its numbers are unusable; ``where`` says whose it is.
+    """
     name = camera.model.name
     if name not in PARAMETERS:
         known = ", ".join(PARAMETERS)
@@ -135,21 +142,22 @@ def _camera(camera: Any, where: str) -> Camera:
     return Camera(width=int(camera.width), height=int(camera.height), **values)
 
 
-def _colmap_camera(pycolmap: Any, camera: Camera, camera_id: int) -> Any:
-    if camera.k3:
-        raise ValueError("COLMAP's OPENCV camera has no k3")
-    params = [getattr(camera, key) for key in PARAMETERS[camera.model]]
-    return pycolmap.Camera(
-        model=camera.model, width=camera.width, height=camera.height, params=params, camera_id=camera_id
-    )
+def colmap_camera(pycolmap: Any, camera: Camera, camera_id: int) -> Any:
+    """Ours as a COLMAP camera; one with k3, which OPENCV lacks, as FULL_OPENCV."""
+    model = "FULL_OPENCV" if camera.k3 else camera.model
+    keys = (*PARAMETERS["OPENCV"], "k3") if camera.k3 else PARAMETERS[model]
+    params = [getattr(camera, key) for key in keys] + ([0.0] * 3 if camera.k3 else [])
+    return pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=params, camera_id=camera_id)
 
 
-def _world_from_cam(image: Any) -> Tensor:
+def world_from_cam_of(image: Any) -> Tensor:
+    """(4, 4) float64 of a registered COLMAP image."""
     matrix = torch.from_numpy(np.array(image.cam_from_world().matrix(), np.float64))
     return invert(rigid(matrix[:, :3], matrix[:, 3]))
 
 
-def _points(model: Any) -> Tensor:
+def points_of(model: Any) -> Tensor:
+    """(P, 3) float32: the model's points, by their number."""
     if not len(model.points3D):
         return torch.zeros(0, 3)
     xyz = np.stack([model.points3D[i].xyz for i in sorted(model.points3D)]).astype(np.float32)

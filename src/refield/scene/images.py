@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from refield.scene.files import write_bytes
 MAX_PIXELS = 64_000_000
 """A 48-megapixel phone photo passes; what is larger is more likely a bomb or a mistake."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
-_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")  # nothing that starts another program (EPS)
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")  # nothing that starts another program (EPS)
 _DIRECT = ("L", "RGB", "1")
 _WITH_ALPHA = ("RGBA", "LA", "PA", "P")  # a palette may carry transparency
 _MARK = ("Software", "refield")  # in every PNG we write, so that we replace no other
@@ -31,12 +31,12 @@ _SWAPPED = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 
 
 @contextmanager
-def _opened(path: Path, max_pixels: int) -> Iterator[Image.Image]:
+def opened(path: Path, max_pixels: int = MAX_PIXELS, formats: Sequence[str] = FORMATS) -> Iterator[Image.Image]:
     """The image's header, size checked; every failure in the block becomes an InputError naming the file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's own size warning; ours is an error below
-            with Image.open(path, formats=_FORMATS) as image:
+            with Image.open(path, formats=tuple(formats)) as image:
                 width, height = image.size
                 if width * height > max_pixels:
                     what = f"{width}x{height} pixels are over the limit of {max_pixels / 1e6:.0f} megapixels"
@@ -47,10 +47,15 @@ def _opened(path: Path, max_pixels: int) -> Iterator[Image.Image]:
     except Image.DecompressionBombError:
         raise InputError(path, "claims a gigantic size", "check the file") from None
     except Image.UnidentifiedImageError:
-        known = ", ".join(_FORMATS)
+        known = ", ".join(formats)
         raise InputError(path, "is not an image that can be read", f"give one of {known}") from None
     except (OSError, ValueError, SyntaxError, EOFError) as error:  # truncated data arrives as any of these
         raise InputError(path, f"cannot be decoded ({error})", "replace the file or leave it out") from None
+
+
+def is_turned(image: Image.Image) -> bool:
+    """Whether EXIF says that the pixels are not as the picture stands upright."""
+    return _orientation(image) != 1
 
 
 def _orientation(image: Image.Image) -> int:
@@ -63,7 +68,7 @@ def read_size(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[int, int]:
     Raises:
         InputError: missing, not an image, or too large.
     """
-    with _opened(path, max_pixels) as image:
+    with opened(path, max_pixels) as image:
         width, height = image.size
         return (height, width) if _orientation(image) in _SWAPPED else (width, height)
 
@@ -75,16 +80,21 @@ def read_image(path: Path, *, max_pixels: int = MAX_PIXELS, background: tuple[in
         InputError: missing, truncated, too large, or of a mode whose colours would be a guess (CMYK,
             16-bit grey).
     """
-    with _opened(path, max_pixels) as image:
-        mode = image.mode
-        if mode not in _DIRECT + _WITH_ALPHA:
-            what = f"has the pixel mode {mode}, whose colours would be a guess"
-            raise InputError(path, what, "save it as 8-bit RGB")
-        upright = ImageOps.exif_transpose(image)
-        if mode in _WITH_ALPHA:
-            upright = upright.convert("RGBA")
-            upright = Image.alpha_composite(Image.new("RGBA", upright.size, (*background, 255)), upright)
-        return torch.from_numpy(np.array(upright.convert("RGB")))
+    with opened(path, max_pixels) as image:
+        return torch.from_numpy(np.array(upright_rgb(path, image, background)))
+
+
+def upright_rgb(path: Path, image: Image.Image, background: tuple[int, int, int] = (0, 0, 0)) -> Image.Image:
+    """An `opened` image as RGB, turned as its EXIF says; raises as `read_image`."""
+    mode = image.mode
+    if mode not in _DIRECT + _WITH_ALPHA:
+        what = f"has the pixel mode {mode}, whose colours would be a guess"
+        raise InputError(path, what, "save it as 8-bit RGB")
+    upright = ImageOps.exif_transpose(image)
+    if mode in _WITH_ALPHA:
+        upright = upright.convert("RGBA")
+        upright = Image.alpha_composite(Image.new("RGBA", upright.size, (*background, 255)), upright)
+    return upright.convert("RGB")
 
 
 def read_mask(path: Path, *, max_pixels: int = MAX_PIXELS) -> Tensor:
@@ -93,7 +103,7 @@ def read_mask(path: Path, *, max_pixels: int = MAX_PIXELS) -> Tensor:
     Raises:
         InputError: missing, truncated, too large, or not an 8-bit image.
     """
-    with _opened(path, max_pixels) as image:
+    with opened(path, max_pixels) as image:
         if image.mode not in _DIRECT + _WITH_ALPHA:
             raise InputError(path, f"has the pixel mode {image.mode}", "save the mask as 8-bit grey")
         grey = np.array(ImageOps.exif_transpose(image).convert("RGB")).max(-1)
@@ -131,7 +141,7 @@ def check_decodes(path: Path) -> None:
     Raises:
         InputError: as `read_image`.
     """
-    with _opened(path, MAX_PIXELS) as image:
+    with opened(path, MAX_PIXELS) as image:
         if image.mode not in _DIRECT + _WITH_ALPHA:
             raise InputError(path, f"has the pixel mode {image.mode}", "save it as 8-bit RGB")
         image.draft(None, (max(image.width // 8, 1), max(image.height // 8, 1)))

@@ -1,4 +1,7 @@
-"""Find out how a capture was handed over, and load it: transforms.json, or a COLMAP model."""
+"""Find out how a capture was handed over, and load it: transforms.json, or a COLMAP model.
+
+Photos without poses are told apart here; they are placed by `refield.photos` and `refield.estimate.localize`.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,17 @@ from refield.scene.files import log_warning
 from refield.scene.left_out import Warn
 
 _GIVE = "a transforms.json (nerfstudio, instant-ngp) or a COLMAP model in sparse/0, with the images beside it"
+
+
+def is_posed(data: Path) -> bool:
+    """Whether there are camera poses: a transforms.json or a COLMAP model, not only photos.
+
+    Raises:
+        InputError: there is no such file or folder.
+    """
+    if not data.exists():
+        raise InputError(data, "there is no such file or folder", f"give the photos' folder, or {_GIVE}")
+    return data.is_file() or (data / transforms_json.NAME).is_file() or bool(colmap.find_models(data))
 
 
 def load_capture(data: Path, *, warn: Warn = log_warning) -> Capture:
@@ -37,15 +51,16 @@ def load_new_photos(photos: Path, capture: Capture, *, warn: Warn = log_warning)
     if not photos.exists():
         raise InputError(photos, "there is no such file or folder", "give the folder of the new photos")
     if photos.is_dir() and not (photos / transforms_json.NAME).is_file():
-        give = "a transforms.json with their poses in the capture's world"
+        give = "a transforms.json with their poses in the capture's world, or the photos alone"
         if colmap.find_models(photos):
             raise InputError(photos, "holds a COLMAP model, which is read for first photos only", f"give {give}")
-        raise _unposed(photos, give)
+        raise _unposed(photos, give, "localize_photos")
     return transforms_json.load_photos(photos, warn=warn)
 
 
-def _unposed(folder: Path, give: str = _GIVE) -> InputError:
+def _unposed(folder: Path, give: str = _GIVE, place: str = "capture_from_photos") -> InputError:
     count = sum(p.suffix.lower() in images.SUFFIXES for p in [*folder.glob("*"), *folder.glob("images/*")])
     if count:
-        return InputError(folder, f"holds {count} photos but no camera poses, which are needed for now", f"give {give}")
+        what = f"holds {count} photos but no camera poses"
+        return InputError(folder, what, f"place them first (refield.{place}), or give {give}")
     return InputError(folder, "holds neither transforms.json nor a COLMAP model", f"give {give}")

@@ -1,4 +1,4 @@
-"""Opens the segmenters and matchers that need weights, from a local folder: config.json and *.safetensors.
+"""Opens the segmenters, matchers and describers that need weights, from a local folder: config.json and *.safetensors.
 
 Nothing is downloaded, unpickled or run from the folder. transformers is imported when a folder is opened, not before.
 """
@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 
+from refield.vision.describer import Describer, DinoDescriber
 from refield.vision.lightglue import LightGlueMatcher
 from refield.vision.matcher import Matcher
 from refield.vision.sam import SAM, SAM2, SAM3, Family, SamSegmenter
@@ -40,6 +41,7 @@ CLASSES: dict[str, dict[str, str]] = {
     "sam3": dict.fromkeys(("sam3_tracker", "sam3_tracker_video", "sam3_video"), "Sam3TrackerModel"),
     "lightglue": {"lightglue": "LightGlueForKeypointMatching"},
     "superglue": {"superglue": "SuperGlueForKeypointMatching"},
+    "dinov2": {"dinov2": "Dinov2Model", "dinov2_with_registers": "Dinov2WithRegistersModel"},
 }
 """by name: the ``model_type`` of config.json -> transformers' class"""
 
@@ -153,6 +155,10 @@ def _matcher(name: str, folder: Path, device: Device = "cpu") -> Matcher:
     return LightGlueMatcher(open_model(folder, CLASSES[name], device), device)
 
 
+def _describer(name: str, folder: Path, device: Device = "cpu") -> Describer:
+    return DinoDescriber(open_model(folder, CLASSES[name], device), device)
+
+
 SEGMENTERS: dict[str, Callable[[Path, Device], Segmenter]] = {
     name: partial(_segmenter, name, family)
     for name, family in {"sam": SAM, "sam-hq": SAM, "sam2": SAM2, "sam3": SAM3}.items()
@@ -163,3 +169,6 @@ MATCHERS: dict[str, Callable[[Path, Device], Matcher]] = {
     name: partial(_matcher, name) for name in ("lightglue", "superglue")
 }
 """by name: (folder, device) -> a matcher; raises `WeightsError`"""
+
+DESCRIBERS: dict[str, Callable[[Path, Device], Describer]] = {"dinov2": partial(_describer, "dinov2")}
+"""by name: (folder, device) -> a describer; raises `WeightsError`"""

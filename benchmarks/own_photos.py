@@ -1,0 +1,242 @@
+"""Photos alone: how well structure from motion finds their poses, and localization those of new ones.
+
+    python benchmarks/own_photos.py --data DATA                   # real photographs: DATA/fox
+    python benchmarks/own_photos.py --data DATA --whole           # DATA/fox_moved all the way, train and update
+    python benchmarks/own_photos.py --world FOLDER [FOLDER …]     # what `refield synth` wrote, poses withheld
+
+Prints one table per section, in Markdown, with date, machine and command. What takes long is kept in ``--work``.
+"the scene" is the largest distance between two cameras.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from record import Row, markdown
+
+from refield.cli import main as refield
+from refield.estimate.localize import Known, localize, localize_photos
+from refield.photos.capture import FromPhotos, capture_from_photos
+from refield.photos.gather import gather
+from refield.scene.capture import Capture, Frame
+from refield.scene.change import PlacedPhoto
+from refield.scene.images import read_image, write_image
+from refield.scene.load import load_capture
+from refield.scene.pose import angle_between, transform
+from refield.scene.similarity import between, pose_errors
+from refield.scene.transforms_json import load_transforms
+from refield.scene.world import world_of
+from refield.synthetic import sample_folder
+from refield.workspace import Workspace
+
+LEFT_OUT = 8
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder with fox/ and fox_moved/ (real photographs)")
+    parser.add_argument("--world", type=Path, nargs="*", default=[], help="folders that `refield synth` wrote")
+    parser.add_argument("--whole", action="store_true", help="only train and update fox_moved, from photos alone")
+    parser.add_argument(
+        "--work", type=Path, default=Path("build/own-photos"), help="where intermediate things are kept"
+    )
+    options = parser.parse_args()
+    print(_conditions())
+    if options.data is not None and options.whole:
+        _whole(options.data / "fox_moved", options.work)
+    elif options.data is not None:
+        found = _motion("fox", options.data / "fox" / "images", options.data / "fox", options.work / "fox")
+        _localization(options.data / "fox" / "images", found, options.work)
+        _rejected(options.data / "fox" / "images", found, options.work)
+    for world in options.world:
+        _world(world, options.work / f"world-{world.name}")
+    return 0
+
+
+def _conditions() -> str:
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    cpu = next((line.split(":")[1].strip() for line in lines if "model name" in line), platform.processor())
+    machine = f"{os.cpu_count()} cores ({cpu}), Python {platform.python_version()}"
+    return f"{datetime.now(UTC):%Y-%m-%d}, {machine}; `python {' '.join(sys.argv)}`\n"
+
+
+def _show(title: str, rows: list[Row]) -> None:
+    print(f"### {title}\n\n{markdown(rows)}\n", flush=True)
+
+
+def _paired(found: Sequence[Frame], true: Sequence[Frame]) -> tuple[list[Frame], list[Frame]]:
+    """The frames of both that are the same photo, by file name."""
+    by_name = {Path(f.name).name: f for f in true}
+    here = [f for f in found if Path(f.name).name in by_name]
+    return here, [by_name[Path(f.name).name] for f in here]
+
+
+def _motion(title: str, photos: Path, given: Path, cache: Path) -> FromPhotos:
+    """Structure from motion against the poses that came with the photos."""
+    shutil.rmtree(cache, ignore_errors=True)
+    began = time.perf_counter()
+    found = capture_from_photos(photos, cache)
+    seconds = time.perf_counter() - began
+    here, there = _paired(found.capture.frames, load_capture(given).frames)
+    away, turned = pose_errors(here, there, between(here, there))
+    size = world_of(Capture(tuple(there))).size
+    row: Row = {
+        "photos": found.photos,
+        "registered": len(found.capture.frames),
+        "centres, % of the scene: median": 100 * float(away.median()) / size,
+        "largest": 100 * float(away.max()) / size,
+        "rotation, °: median": float(turned.median()),
+        "largest ": float(turned.max()),
+        "points": len(found.capture.points),
+        "seconds": seconds,
+    }
+    _show(f"Structure from motion: {title}", [row])
+    return found
+
+
+def _subset(photos: Path, names: Sequence[str], to: Path) -> Path:
+    shutil.rmtree(to, ignore_errors=True)
+    to.mkdir(parents=True)
+    for name in names:
+        shutil.copyfile(photos / name, to / name)
+    return to
+
+
+def _localization(photos: Path, full: FromPhotos, work: Path) -> None:
+    """Some photos left out of the reconstruction, placed in it, and compared with that of all photos."""
+    names = [f.name for f in full.capture.frames]
+    out = names[3 :: len(names) // LEFT_OUT][:LEFT_OUT]
+    rest = capture_from_photos(_subset(photos, [n for n in names if n not in out], work / "rest"), work / "rest-cache")
+    known = Known(rest.capture, rest.landmarks, rest.landmarks.globals_)
+    here, there = _paired(rest.capture.frames, full.capture.frames)
+    to_full = between(here, there)
+    size = world_of(full.capture).size
+    gathered = gather(_subset(photos, out, work / "new"), work / "new-cache", among=False)
+    rows: list[Row] = []
+    for photo in gathered.photos:
+        began = time.perf_counter()
+        (placed,) = localize([photo], known)
+        rows.append(_row(placed, time.perf_counter() - began))
+        if placed.frame is not None:
+            away, turned = pose_errors(*_paired([placed.frame], full.capture.frames), to_full)
+            rows[-1] |= {"centre, % of the scene": 100 * float(away) / size, "rotation, °": float(turned)}
+    _show(f"Localization: {len(out)} photos left out of {len(names)}, against the reconstruction of all", rows)
+
+
+def _row(placed: PlacedPhoto, seconds: float) -> Row:
+    p = placed.placement
+    told = {"inliers": p.inliers, "matches": p.matches, "error, px": p.error} if p is not None else {}
+    return {"photo": placed.name, "status": placed.status, **told, "seconds": seconds}
+
+
+def _spoilt() -> dict[str, Callable[[np.ndarray], np.ndarray]]:
+    dark, line = np.zeros((1, 1, 3), np.uint8), np.zeros((41, 41), np.float32)
+    line[20] = 1 / 41
+    return {
+        "black": lambda image: np.broadcast_to(dark, image.shape).copy(),
+        "blurred (σ 8 px)": lambda image: cv2.GaussianBlur(image, (0, 0), 8),
+        "moved (41 px)": lambda image: cv2.filter2D(image, -1, line),
+    }
+
+
+def _rejected(photos: Path, full: FromPhotos, work: Path) -> None:
+    """Photos that cannot be placed: all of them must be rejected."""
+    known = Known(full.capture, full.landmarks, full.landmarks.globals_)
+    folder = work / "spoilt"
+    shutil.rmtree(folder, ignore_errors=True)
+    pick = [f.name for f in full.capture.frames][:: max(len(full.capture.frames) // 6, 1)]
+    for what, spoil in _spoilt().items():
+        for i, name in enumerate(pick):
+            image = spoil(read_image(photos / name).numpy())
+            # one pixel of a black photo differs, so that it is not the same picture as the one before it
+            image[0, 0] = i
+            write_image(folder / what / f"{i}.png", torch.from_numpy(image))
+    for i, path in enumerate(sorted((sample_folder() / "before" / "images").iterdir())[:12]):
+        image = cv2.resize(read_image(path).numpy(), (960, 960), interpolation=cv2.INTER_CUBIC)
+        write_image(folder / "of another scene" / f"{i}.png", torch.from_numpy(image))
+    rows: list[Row] = []
+    for kind in sorted(folder.iterdir()):
+        placed = localize_photos(kind, known, work / "spoilt-cache" / kind.name)
+        rejected = [p for p in placed if p.frame is None]
+        row: Row = {"photos": kind.name, "rejected": f"{len(rejected)} of {len(placed)}"}
+        rows.append(row | {"for example": rejected[0].why if rejected else "–"})
+    _show("Photos that cannot be placed", rows)
+
+
+def _world(world: Path, work: Path) -> None:
+    """A world of `refield synth` with all poses withheld: the old photos reconstructed, the new ones placed."""
+    found = _motion(world.name, world / "before" / "images", world / "before", work)
+    known = Known(found.capture, found.landmarks, found.landmarks.globals_)
+    to_true = between(*_paired(found.capture.frames, load_capture(world / "before").frames))
+    size = world_of(load_capture(world / "before")).size
+    rows: list[Row] = []
+    for part in ("after", "eval"):
+        true = load_transforms(world / part).frames
+        began = time.perf_counter()
+        placed = localize_photos(world / part / "images", known, work / part)
+        seconds = (time.perf_counter() - began) / len(placed)
+        for photo in placed:
+            rows.append({"of": part, **_row(photo, seconds)})
+            if photo.frame is not None:
+                away, turned = pose_errors(*_paired([photo.frame], true), to_true)
+                rows[-1] |= {"centre, % of the scene": 100 * float(away) / size, "rotation, °": float(turned)}
+    _show(f"Localization: new photos of {world.name}", rows)
+
+
+def _whole(data: Path, work: Path) -> None:
+    """Train and update from photos alone, by the command line; the change found against the true one."""
+    place = work / "whole"
+    shutil.rmtree(place, ignore_errors=True)
+    seconds = []
+    for command in (["train", data / "before" / "images", place], ["update", place, data / "after" / "images"]):
+        began = time.perf_counter()
+        code = refield([str(c) for c in command])
+        seconds.append(time.perf_counter() - began)
+        if code != 0:
+            _show("The whole way", [{"command": command[0], "exit code": code, "seconds": seconds[-1]}])
+            return
+    workspace = Workspace.open(place)
+    capture, true = workspace.capture(), load_capture(data / "before")
+    names = sorted(p.name for p in (data / "before" / "images").iterdir())
+    here = [f for f in capture.frames]
+    # the workspace names photos by index; all were registered, or the pairing would not be known
+    if len(here) != len(names):
+        print(f"{len(here)} of {len(names)} photos registered: the change is not compared", flush=True)
+        return
+    there = {Path(f.name).name: f for f in true.frames}
+    known = between(here, [there[n] for n in names])
+    change = workspace.change(1)
+    rows: list[Row] = []
+    for o in change.objects:
+        row: Row = {"kind": o.kind, "confidence": float(o.confidence), "note": o.note}
+        row["centre, true units"] = ", ".join(f"{v:.2f}" for v in known.point(o.grid.tight_aabb().mean(0).double()))
+        if o.new_from_old is not None:
+            row |= _against_truth(known.motion(o.new_from_old), data)
+        rows.append(row)
+    used = f"{len(change.frames)} of {len(change.photos)} new photos placed"
+    _show(f"The whole way, from photos alone ({used}; train {seconds[0]:.0f} s, update {seconds[1]:.0f} s)", rows)
+
+
+def _against_truth(motion: torch.Tensor, data: Path) -> Row:
+    (true,) = json.loads((data / "truth.json").read_text())
+    expected = torch.tensor(true["T"], dtype=torch.float64)
+    centre = torch.tensor(true["centre"], dtype=torch.float64)  # where it was
+    away = float((transform(motion, centre) - transform(expected, centre)).norm())
+    wide = 2 * max(true["half_size"])
+    return {"off, % of its size": 100 * away / wide, "off, °": float(angle_between(motion, expected))}
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

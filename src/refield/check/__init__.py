@@ -1,0 +1,1 @@
+"""A capture looked over before any time is spent on it: ``refield check``."""
