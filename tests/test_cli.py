@@ -166,6 +166,20 @@ def test_updates_stack(place, monkeypatch, capsys):
     assert main(["evaluate", "work", "new", "--visit", "1"]) == 0
 
 
+def test_the_other_architecture_all_the_way(place, monkeypatch, capsys):
+    """NeRFacto's: trained, kept, updated and rendered by the same commands."""
+    shape = ["samples", "4", "levels", "2", "finest", "32", "log2-table", "8", "width", "8", "occupancy", "16"]
+    few = [f"--nerfacto.field.{a}" if i % 2 == 0 else a for i, a in enumerate(shape)]
+    few += ["--nerfacto.steps", "5", "--nerfacto.rays", "64"]
+    assert main(["train", "data", "other", "--architecture", "nerfacto", *few]) == 0
+    assert json.loads((place / "other/field/field.json").read_text())["architecture"] == "NerfactoField"
+    monkeypatch.setattr(update, "MOST_LOST", 100.0)
+    believing(monkeypatch, "moved")
+    assert main(["update", "other", "new", *FEW]) == 0
+    assert main(["render", "other", "--cameras", "new/transforms.json", "--out", "pictures"]) == 0
+    assert read_image(place / "pictures/000.png").shape == (24, 32, 3)
+
+
 def test_visits_are_listed_and_taken_back(place, monkeypatch, capsys):
     monkeypatch.setattr(update, "MOST_LOST", 100.0)
     assert main(["visits", "work"]) == 0

@@ -29,6 +29,7 @@ from refield.artefacts import (
     writable,
     write_tensors,
 )
+from refield.field.nerfacto import NerfactoField
 from refield.field.radiance import HashField
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import PlacedPhoto, SceneChange
@@ -44,6 +45,7 @@ MARKER, WORLD = "refield.json", "world.json"
 FORMAT = 1
 CACHE = ".photos"
 """what structure from motion has found, kept while it goes on and for the next time; may be deleted"""
+_ARCHITECTURES: dict[str, type[HashField] | type[NerfactoField]] = {c.__name__: c for c in (HashField, NerfactoField)}
 _OURS = (MARKER, "capture", "field", "visits")
 
 
@@ -171,18 +173,18 @@ class Workspace:
         """The photos that the field was fitted to."""
         return load_transforms(self.path / "capture", decode=False)
 
-    def keep_field(self, field: HashField, psnr: float = math.nan) -> None:
+    def keep_field(self, field: HashField | NerfactoField, psnr: float = math.nan) -> None:
         """Write the fitted field and, if known, its PSNR on held-out pixels (dB)."""
         tensors, facts = field.state()
         facts["held_out_psnr"] = psnr if math.isfinite(psnr) else None
         write_tensors(self.path / "field", tensors, facts)
 
-    def field(self) -> HashField:
-        """The field before any visit."""
+    def field(self) -> HashField | NerfactoField:
+        """The field before any visit, of either architecture."""
         folder = self.path / "field"
         tensors, facts = read_tensors(folder)
         try:
-            return HashField.from_state(tensors, facts)
+            return _ARCHITECTURES[facts["architecture"]].from_state(tensors, facts)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise InputError(folder, f"does not describe a field ({error})", "train again") from None
 

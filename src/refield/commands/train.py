@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
-from refield.field.fit import FitConfig, NonFiniteError, fit_field
+from refield.field.fit import FitConfig, NonFiniteError, ProgressCallback, fit_field
+from refield.field.fit_nerfacto import NerfactoFitConfig, fit_nerfacto
 from refield.field.memory import Memory, memory_fault, memory_of
+from refield.field.nerfacto import NerfactoField
+from refield.field.radiance import HashField
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
 from refield.photos.landmarks import Landmarks, write_landmarks
 from refield.scene.capture import Capture, centres
@@ -34,14 +37,18 @@ class Train:
     """metres per unit of the world, if you know them: lengths are then told in metres too"""
     poses: FromPhotosConfig = field(default_factory=FromPhotosConfig)
     """photos without poses: how they are taken in, and how their poses are found"""
+    architecture: Literal["hash", "nerfacto"] = "hash"
+    """of the field: hash, which fits on a CPU in less than a minute, or NeRFacto's, which asks for more time there"""
     fit: FitConfig = field(default_factory=FitConfig)
+    nerfacto: NerfactoFitConfig = field(default_factory=NerfactoFitConfig)
 
 
 def run(options: Train) -> None:
     clock = Clock()
     _check_scale(options.scale)
     task = Sources(options.data, options.work, options.poses, options.scale)
-    train(task, clock, options.fit, overwrite=options.overwrite)
+    config = options.fit if options.architecture == "hash" else options.nerfacto
+    train(task, clock, config, overwrite=options.overwrite)
     clock.console.print(f"The field is in {options.work} ({clock.total:.1f} s).", markup=False)
 
 
@@ -55,7 +62,9 @@ class Sources:
     scale: float | None = None
 
 
-def train(task: Sources, clock: Clock, config: FitConfig, *, overwrite: bool, made_by: str = "train") -> float:
+def train(
+    task: Sources, clock: Clock, config: FitConfig | NerfactoFitConfig, *, overwrite: bool, made_by: str = "train"
+) -> float:
     """Load, fit, keep. Returns the PSNR on held-out pixels, dB (NaN where none is held out).
 
     Raises:
@@ -76,7 +85,7 @@ def train(task: Sources, clock: Clock, config: FitConfig, *, overwrite: bool, ma
         clock.console.print(f"           memory: {needed}", markup=False)
         try:
             with clock.training("fit") as line:
-                fitted = fit_field(capture, config, line)
+                fitted = _fitted(capture, config, line)
         except NonFiniteError as error:
             if error.field is None or error.steps == 0:
                 raise
@@ -86,6 +95,14 @@ def train(task: Sources, clock: Clock, config: FitConfig, *, overwrite: bool, ma
         workspace.keep_field(fitted, line.psnr)
     clock.stop()
     return line.psnr
+
+
+def _fitted(
+    capture: Capture, config: FitConfig | NerfactoFitConfig, on_progress: ProgressCallback
+) -> HashField | NerfactoField:
+    if isinstance(config, FitConfig):
+        return fit_field(capture, config, on_progress)
+    return fit_nerfacto(capture, config, on_progress)
 
 
 def _loaded(task: Sources, clock: Clock) -> tuple[Capture, Landmarks | None]:

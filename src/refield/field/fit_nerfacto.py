@@ -18,6 +18,7 @@ from refield.field.nerfacto import NerfactoConfig, NerfactoField, looking_everyw
 from refield.field.photos import HeldOut
 from refield.field.pixels import PixelBank
 from refield.field.proposal import Histogram, annealing
+from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples, accumulate_rgb, weights
 from refield.scene.capture import Capture, Rays
 
@@ -76,7 +77,13 @@ def fit_nerfacto(
     torch.manual_seed(config.seed)
     model = NerfactoField(config.field, looking_everywhere(place_contraction(capture), config.field), config.seed)
     _NerfactoFit(model, capture, config, on_progress).run()
-    return model.eval().requires_grad_(False)
+    model.eval().requires_grad_(False)
+    # proposals know nothing of what an update moves: its field is marched through, where this one may hold something
+    sampler = OccupancySampler.from_density(
+        model.density, model.contraction, model.sampler.step, model.sampler.resolution
+    )
+    model.looking_where(sampler.grid)
+    return model
 
 
 class _NerfactoFit:

@@ -6,6 +6,7 @@ import os
 from dataclasses import dataclass
 
 from refield.field.fit import FitConfig, most_pixels
+from refield.field.fit_nerfacto import NerfactoFitConfig
 from refield.field.pixels import DIRECTIONS_MOST
 from refield.field.render import CHUNK
 from refield.field.sampling import RESOLUTION
@@ -36,17 +37,18 @@ class Memory:
         return f"{_short(self.total)}: " + ", ".join(f"{name} {_short(n)}" for n, name in parts)
 
 
-def memory_of(capture: Capture, config: FitConfig) -> Memory:
-    """What :func:`fit_field` will take for this capture."""
+def memory_of(capture: Capture, config: FitConfig | NerfactoFitConfig) -> Memory:
+    """What the fit of either architecture will take for this capture."""
     pixels = sum(f.camera.width * f.camera.height for f in capture.train)
-    most = most_pixels(config)
+    most = most_pixels(config) if isinstance(config, FitConfig) else None
     photos = 3 * pixels if most is None or pixels <= most else 7 * most  # with its place in the photo
     distinct = 12 * sum(c.width * c.height for c in {f.camera for f in capture.train})
     shape = config.field
     tables = shape.levels * (1 << shape.log2_table) * 8
+    a_step = config.samples if isinstance(config, FitConfig) else 3 * config.rays * config.field.samples
     cells = RESOLUTION**3 * (16 + 1 + 1 + 8)
     sample = 3 * 8 * shape.levels + 40
-    work = CHUNK * _ROOM * (8 * shape.levels + 28) + 2 * config.samples * sample
+    work = CHUNK * _ROOM * (8 * shape.levels + 28) + 2 * a_step * sample
     return Memory(photos, distinct if distinct <= DIRECTIONS_MOST else 0, 4 * tables + cells, work)
 
 
