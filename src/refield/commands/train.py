@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
 from refield.field.fit import FitConfig, NonFiniteError, ProgressCallback, fit_field
-from refield.field.fit_nerfacto import NerfactoFitConfig, fit_nerfacto
+from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig, fit_nerfacto
 from refield.field.memory import Memory, memory_fault, memory_of
 from refield.field.nerfacto import NerfactoField
 from refield.field.radiance import HashField
@@ -37,8 +37,9 @@ class Train:
     """metres per unit of the world, if you know them: lengths are then told in metres too"""
     poses: FromPhotosConfig = field(default_factory=FromPhotosConfig)
     """photos without poses: how they are taken in, and how their poses are found"""
-    architecture: Literal["hash", "nerfacto"] = "hash"
-    """of the field: hash, which fits on a CPU in less than a minute, or NeRFacto's, which asks for more time there"""
+    architecture: Literal["hash", "nerfacto", "nerfacto-reduced"] = "hash"
+    """of the field: hash, which fits on a CPU in less than a minute; NeRFacto's, for long fits; or that one reduced to
+    what a CPU can train in minutes, which heeds no ``nerfacto`` option but the time limit and the seed"""
     fit: FitConfig = field(default_factory=FitConfig)
     nerfacto: NerfactoFitConfig = field(default_factory=NerfactoFitConfig)
 
@@ -47,9 +48,16 @@ def run(options: Train) -> None:
     clock = Clock()
     _check_scale(options.scale)
     task = Sources(options.data, options.work, options.poses, options.scale)
-    config = options.fit if options.architecture == "hash" else options.nerfacto
-    train(task, clock, config, overwrite=options.overwrite)
+    train(task, clock, _config_of(options), overwrite=options.overwrite)
     clock.console.print(f"The field is in {options.work} ({clock.total:.1f} s).", markup=False)
+
+
+def _config_of(options: Train) -> FitConfig | NerfactoFitConfig:
+    if options.architecture == "hash":
+        return options.fit
+    long = options.nerfacto
+    reduced = replace(REDUCED, max_seconds=long.max_seconds, seed=long.seed)
+    return long if options.architecture == "nerfacto" else reduced
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from refield.field import kernels
 from refield.field.fit import MOST_SKIPPED, FitProgress, NonFiniteError, ProgressCallback, place_contraction
 from refield.field.interlevel import interlevel_loss
 from refield.field.losses import colour_loss, scale_gradients
-from refield.field.nerfacto import NerfactoConfig, NerfactoField, looking_everywhere
+from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
 from refield.field.photos import HeldOut
 from refield.field.pixels import PixelBank
 from refield.field.proposal import Histogram, annealing
@@ -61,6 +61,23 @@ class NerfactoFitConfig:
     check_every: int = 250
     """steps between looks at the held-out pixels"""
     seed: int = 0
+
+
+REDUCED = NerfactoFitConfig(
+    steps=1500,
+    rays=1024,
+    decay_steps=1500,
+    field=NerfactoConfig(
+        (ProposalConfig(64, 128, log2_table=14), ProposalConfig(32, 256, log2_table=14)),
+        samples=24,
+        levels=8,
+        finest=512,
+        log2_table=16,
+        width=32,
+        first_density=0.1,
+    ),
+)
+"""A shape and a schedule for a CPU: nerfstudio's take hours there"""
 
 
 def fit_nerfacto(
