@@ -1,0 +1,48 @@
+"""Old photos as if taken now: what a later update may learn from."""
+
+import torch
+
+from refield.field.render import render_camera
+from refield.history import known_objects, retouched
+from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
+from refield.scene.images import frame_image
+from refield.update.composite import UpdatedField
+from tests.captures import write_capture
+from tests.fields import small_field
+from tests.update.worlds import Ball, BallWorld, at, change_of, grid_of
+
+
+def test_old_photos_are_brought_up_to_date_when_they_are_looked_at(tmp_path):
+    capture = write_capture(tmp_path / "data", 3)
+    ball = Ball(at(0.0, 0.0, 0.25), 0.25)
+    old = BallWorld((ball,))
+    now = UpdatedField(old, change_of(ObjectChange("removed", grid_of(ball))))
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    assert retouched(capture, old, old, scratch) is capture
+    later = retouched(capture, old, now, scratch)
+    assert not list(scratch.iterdir())
+    frame, was = later.frames[1], capture.frames[1]
+    image, photo = frame_image(frame).float() / 255, frame_image(was).float() / 255
+    assert [p.name for p in scratch.iterdir()] == ["0001.png"]
+    assert torch.equal(frame.world_from_cam, was.world_from_cam) and frame.camera == was.camera
+    shown = [render_camera(f, was.camera, was.world_from_cam).rgb for f in (old, now)]
+    differs = (shown[0] - shown[1]).abs().amax(-1) > 0.05
+    assert differs.any()
+    assert float((image - shown[1])[differs].abs().amax()) < 0.01
+    same = (image - photo).abs().amax(-1) < 0.01
+    assert same.any() and not same[differs].all()
+    assert torch.equal(frame_image(frame), (image * 255).to(torch.uint8))  # and not made again
+
+
+def test_what_moved_is_known_where_it_is_now():
+    grid = OccupancyGrid(torch.tensor([[-0.3, -0.3, -0.3], [0.3, 0.3, 0.3]]), torch.ones(5, 5, 5))
+    there = torch.eye(4, dtype=torch.float64)
+    there[0, 3] = 1.0
+    old = small_field()
+    assert known_objects(old) == []
+    now = UpdatedField(old, SceneChange((ObjectChange("moved", grid, there),)))
+    (known,) = known_objects(now)
+    assert torch.allclose(known.tight_aabb().mean(0), torch.tensor([1.0, 0.0, 0.0]), atol=0.05)
+    gone = UpdatedField(now, SceneChange((ObjectChange("removed", known),)))
+    assert known_objects(gone) == []
