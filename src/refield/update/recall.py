@@ -106,8 +106,9 @@ def without(field: Field, origin: Origin, *, departed: bool) -> Field:
         earlier = replace(earlier, places=_less(earlier.places, o.grid, kept))
     else:
         region = _less(region, o.grid, kept)
-    return _rebuilt(field, field.pretrained, region=region, bare=kept, shading=shading, earlier=earlier,
-                    skipped=skipped)  # fmt: skip
+    return _rebuilt(
+        field, field.pretrained, region=region, bare=kept, shading=shading, earlier=earlier, skipped=skipped
+    )
 
 
 def _rebuilt(field: UpdatedField, inner: Field, **changed: object) -> UpdatedField:
