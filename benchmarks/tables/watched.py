@@ -32,7 +32,7 @@ class Snapshot:
         """What the update would have given had it ended here."""
         f = self.frozen
         lit = {"region": f.region, "light": f.light, "shading": f.shading, "eyes": f.eyes, "bare": f.bare}
-        return UpdatedField(f.pretrained, f.change, self.helper, **lit)
+        return UpdatedField(f.pretrained, f.change, self.helper, earlier=f.earlier, **lit)
 
 
 @contextmanager

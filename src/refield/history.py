@@ -19,7 +19,7 @@ from refield.field.render import render_many
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change import OccupancyGrid
 from refield.scene.images import frame_image, write_image
-from refield.update.composite import UpdatedField, leaving
+from refield.update.composite import UpdatedField, layers_of, leaving
 from refield.update.store import load_updated
 from refield.workspace import Workspace
 
@@ -103,9 +103,8 @@ def _differs(frame: Frame, before: Field, now: Field, changed: Sequence[Tensor])
 def _changed_boxes(now: Field) -> list[Tensor]:
     """World boxes (2, 3) of everything that the visits that led to a field changed, light included."""
     boxes: list[Tensor] = []
-    while isinstance(now, UpdatedField):
-        boxes += now.boxes + ((now.light.aabb,) if now.light is not None else ())
-        now = now.pretrained
+    for update in layers_of(now):
+        boxes += update.boxes + ((update.light.aabb,) if update.light is not None else ())
     return boxes
 
 

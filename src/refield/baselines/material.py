@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,7 +11,7 @@ from refield.field.photos import Since
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import SceneChange
 from refield.update.config import UpdateConfig
-from refield.update.supervision import Place, Places, places_of
+from refield.update.supervision import Places, places_of, united
 from refield.vision.pixels import dilate
 
 SHADOW = UpdateConfig.shadow
@@ -40,19 +39,8 @@ def still_holds(places: Places, index: int | None, frame: Frame, shadow: float =
 
     ``index`` is the photo's among the training photos, None for another.
     """
-    was, now = (_union(p, index, frame) for p in (places.was, places.now))
+    was, now = (united(p, index, frame) for p in (places.was, places.now))
     if was is None or now is None:
         return torch.zeros(frame.camera.height, frame.camera.width, dtype=torch.bool)
     blocked = dilate(was, math.ceil(shadow * frame.camera.width)) | dilate(now, 1)
     return torch.from_numpy(~blocked)
-
-
-def _union(places: tuple[Place, ...], index: int | None, frame: Frame) -> np.ndarray | None:
-    """All the objects' masks in an old photo, (H, W); None if one is unsure."""
-    total = np.zeros((frame.camera.height, frame.camera.width), bool)
-    for place in places:
-        mask = place.silhouette(frame) if index is None else place.mask(index, frame)
-        if mask is None:
-            return None
-        total |= mask
-    return total

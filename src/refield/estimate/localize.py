@@ -20,7 +20,7 @@ from refield.estimate.intrinsics import guesses
 from refield.photos.features import photo_features
 from refield.photos.gather import OnProgress, gather
 from refield.photos.landmarks import Landmarks, describe, read_landmarks, triangulated, write_landmarks
-from refield.photos.motion import Counting
+from refield.photos.motion import Counting, silent
 from refield.photos.taken import PhotoConfig, Taken, pixels_of
 from refield.scene.capture import Capture, Frame, centres
 from refield.scene.change import PlacedPhoto, Placement
@@ -95,7 +95,7 @@ def localize_photos(
     Raises:
         InputError: there are no photos.
     """
-    count = counting or (lambda what: lambda done, total: None)
+    count = counting or silent
     gathered = gather(folder, cache / "new", photos or PhotoConfig(), count("photos"), among=False)
     placed = localize(gathered.photos, known, config, count("placed"))
     return [*placed, *(PlacedPhoto(name, "rejected", why) for name, why in gathered.left_out)]
@@ -120,7 +120,7 @@ def known_by(
     """What new photos are placed in; a describer looks at every old photo first."""
     if describer is None:
         return Known(capture, landmarks, landmarks.globals_)
-    tell, vectors = (counting or (lambda what: lambda done, total: None))("old photos described"), []
+    tell, vectors = (counting or silent)("old photos described"), []
     for i, frame in enumerate(capture.frames):
         vectors.append(describer.describe(read_image(frame.path).numpy()))
         tell(i + 1, len(capture.frames))

@@ -8,7 +8,7 @@ from pathlib import Path
 from refield.photos.database import Database
 from refield.photos.gather import Gathered, gather
 from refield.photos.landmarks import NAME, Landmarks, landmarks_of, write_landmarks
-from refield.photos.motion import Counting, Motion, MotionConfig, reconstruct
+from refield.photos.motion import Counting, Motion, MotionConfig, reconstruct, silent
 from refield.photos.taken import PhotoConfig
 from refield.scene.capture import Capture
 from refield.scene.errors import InputError
@@ -56,7 +56,7 @@ def capture_from_photos(
     Raises:
         InputError: too few photos can be used, or can be placed in one model.
     """
-    count = counting or (lambda what: lambda done, total: None)
+    count = counting or silent
     gathered = gather(folder, cache, config.photos, count("photos"))
     total = len(gathered.photos) + len(gathered.left_out)
     _enough(folder, gathered, total)

@@ -22,7 +22,7 @@ from torch import Tensor
 from refield.photos.database import Database
 from refield.photos.lens import Lens
 from refield.photos.look import Look, look_at, usual_sharpness
-from refield.photos.motion import Counting, MotionConfig, globals_of, pairs_of, words_of
+from refield.photos.motion import Counting, MotionConfig, globals_of, pairs_of, silent, words_of
 from refield.photos.taken import Taken
 from refield.scene.capture import Capture
 from refield.scene.colmap import colmap_camera, quiet_pycolmap
@@ -102,7 +102,7 @@ def triangulated(
         InputError: a photo cannot be read, or hardly any points agree with the poses.
     """
     pycolmap, config = quiet_pycolmap(), config or MotionConfig()
-    count = counting or (lambda what: lambda done, total: None)
+    count = counting or silent
     photos = _as_taken(capture)
     with Database.opened(cache, config.features) as database:
         shared = {c: colmap_camera(pycolmap, c, 0) for c in {f.camera for f in capture.frames}}

@@ -27,6 +27,13 @@ from refield.vision.vlad import learn_words, vlad
 
 Counting = Callable[[str], OnProgress]
 """Called with what is counted; gives what is called with how many are done, and how many there are"""
+
+
+def silent(what: str) -> OnProgress:
+    """Counts nothing aloud."""
+    return lambda done, total: None
+
+
 _FULL_LENS = 8  # photos of one camera, from which on its whole distortion is looked for
 _CENTRE = 30  # and its principal point: of fewer it comes out worse than the middle
 
@@ -71,7 +78,7 @@ def reconstruct(
     if len(photos) < 3:
         what = f"{len(photos)} photos are too few to find where they were taken"
         raise InputError("photos", what, "give 50 or more, from many sides")
-    count = counting or (lambda what: lambda done, total: None)
+    count = counting or silent
     database.set_cameras(photos, first_cameras(photos))
     database.add_features(photos, count("features"))
     database.add_matches(pairs_of(photos, database, config), count("matches"))

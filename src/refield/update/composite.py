@@ -7,6 +7,7 @@ cut out: nothing is left inside them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -94,7 +95,8 @@ class UpdatedField:
         the change's objects that it names as undone, and those in ``skipped``, are as the old field shows them.
         ``untaught`` is where something stood while the helper learnt: the old field knows better what is under it.
         """
-        self.untaught, self._was = untaught, carved(change, SKIN * pretrained.sampler.step)
+        self.untaught = untaught
+        self._was = carved(change, SKIN * pretrained.sampler.step) if untaught.grids else NOWHERE
         self.earlier, self.skipped = earlier, skipped | {origin.object for origin in earlier.undone}
         self.pretrained, self.change, self.helper, self.light = pretrained, change, helper, light
         self.shading, self.eyes, self.bare = shading, eyes, bare
@@ -255,6 +257,13 @@ class _Routed:
     """rows of the helper; of nobody where there is none"""
     ground: Tensor
     """rows of the earlier state that knows the place"""
+
+
+def layers_of(field: Field) -> Iterator[UpdatedField]:
+    """The updates that a field has had, the latest first."""
+    while isinstance(field, UpdatedField):
+        yield field
+        field = field.pretrained
 
 
 def _part(change: SceneChange, without: frozenset[int]) -> SceneChange:

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from refield.field.render import render_many
-from refield.scene.capture import Frame, camera_rays
+from refield.scene.capture import Frame
 from refield.update.composite import UpdatedField
-from refield.update.region import Region, meets
-from refield.update.supervision import Lessons
+from refield.update.region import Region
+from refield.update.supervision import Lessons, finely, silhouette
 
 _PIXELS = 20_000  # compared
 # What an earlier visit says of a place may be so many times as wrong as what did not change (a helper's ground, a
@@ -50,9 +50,7 @@ def _error(field: UpdatedField, seen: Lessons, which: torch.Tensor) -> float:
 
 
 def _silhouette(region: Region, frame: Frame) -> np.ndarray:
-    shape = (frame.camera.height, frame.camera.width)
+    """(H, W) bool; nothing for an empty region."""
     if not region.grids:
-        return np.zeros(shape, bool)
-    size = float((region.box[1] - region.box[0]).max())
-    rays = camera_rays(frame.camera, frame.world_from_cam)
-    return meets(region.sampler(size / 100, resolution=128), rays).reshape(shape).numpy()
+        return np.zeros((frame.camera.height, frame.camera.width), bool)
+    return silhouette(finely(region), frame)

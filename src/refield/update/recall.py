@@ -16,7 +16,7 @@ from refield.field.radiance import Field
 from refield.field.warp import Move, inside_box, outline
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.pose import transform
-from refield.update.composite import Earlier, Origin, UpdatedField
+from refield.update.composite import Earlier, Origin, UpdatedField, layers_of
 from refield.update.region import Region, carved, grown, move_out
 
 _SAME = 0.5  # of one grid's nodes that lie in the other
@@ -48,14 +48,15 @@ def earlier_of(field: Field, change: SceneChange, dilation: float) -> tuple[Fiel
 def _unknown(field: Field | None) -> Region:
     """Where something stood while every helper learnt, at a place that the fitted field does not know either."""
     grids: list[OccupancyGrid] = []
-    while isinstance(field, UpdatedField):
-        was = carved(field.change, _TAUGHT * field.pretrained.sampler.step)
-        for stood in field.untaught.grids:
+    for update in () if field is None else layers_of(field):
+        if not update.untaught.grids:
+            continue
+        was = carved(update.change, _TAUGHT * update.pretrained.sampler.step)
+        for stood in update.untaught.grids:
             x = stood.nodes()
             both = stood.contains(x) & was.contains(x)
             if both.any():
                 grids.append(OccupancyGrid(stood.aabb, both.float()))
-        field = field.pretrained
     return Region(tuple(grids))
 
 
@@ -130,13 +131,11 @@ def _rebuilt(field: UpdatedField, inner: Field, **changed: object) -> UpdatedFie
 
 def _brought(field: Field, place: OccupancyGrid) -> tuple[int, int] | None:
     """The layer and index of the object that an earlier change brought to a place."""
-    layer = 0
-    while isinstance(field, UpdatedField):
-        for i, o in enumerate(field.change.objects):
-            there = None if i in field.skipped else o.grid_now
+    for layer, update in enumerate(layers_of(field)):
+        for i, o in enumerate(update.change.objects):
+            there = None if i in update.skipped else o.grid_now
             if there is not None and _part_in(place, there) > _SAME:
                 return layer, i
-        field, layer = field.pretrained, layer + 1
     return None
 
 
@@ -170,22 +169,16 @@ def _near_identity(new_from_old: Tensor, grid: OccupancyGrid, step: float) -> bo
 
 
 def _removed_from(field: Field, place: OccupancyGrid) -> tuple[int, int] | None:
-    layer = 0
-    while isinstance(field, UpdatedField):
-        for i, o in enumerate(field.change.objects):
-            here = o.kind == "removed" and i not in field.skipped
+    for layer, update in enumerate(layers_of(field)):
+        for i, o in enumerate(update.change.objects):
+            here = o.kind == "removed" and i not in update.skipped
             if here and min(_part_in(place, o.grid), _part_in(o.grid, place)) > _SAME:
                 return layer, i
-        field, layer = field.pretrained, layer + 1
     return None
 
 
 def _object(field: Field, layer: int, index: int) -> ObjectChange:
-    for _ in range(layer):
-        assert isinstance(field, UpdatedField)  # the layer was counted on it
-        field = field.pretrained
-    assert isinstance(field, UpdatedField)
-    return field.change.objects[index]
+    return list(layers_of(field))[layer].change.objects[index]
 
 
 def _part_in(grid: OccupancyGrid, other: OccupancyGrid) -> float:

@@ -55,17 +55,29 @@ class Place:
     arrived_only: bool
     """An added object's: nothing stood there before"""
 
-    def mask(self, index: int, frame: Frame) -> np.ndarray | None:
-        """In an old training photo, (H, W) bool; None if the estimate was unsure."""
-        if index < len(self.masks):
+    def mask(self, index: int | None, frame: Frame) -> np.ndarray | None:
+        """In an old photo, (H, W) bool; None if the estimate was unsure. ``index`` is its own among the training
+        photos; of others (None) the estimate knows nothing."""
+        if index is not None and index < len(self.masks):
             mask = self.masks[index]
             return None if mask is None else mask.numpy()
         return self.silhouette(frame)
 
     def silhouette(self, frame: Frame) -> np.ndarray:
         """Where the object projects in a photo, hidden or not, (H, W) bool."""
-        hit = meets(self.sampler, camera_rays(frame.camera, frame.world_from_cam))
-        return hit.reshape(frame.camera.height, frame.camera.width).numpy()
+        return silhouette(self.sampler, frame)
+
+
+def silhouette(sampler: OccupancySampler, frame: Frame) -> np.ndarray:
+    """Where what a sampler looks at projects in a photo, hidden or not, (H, W) bool."""
+    hit = meets(sampler, camera_rays(frame.camera, frame.world_from_cam))
+    return hit.reshape(frame.camera.height, frame.camera.width).numpy()
+
+
+def finely(region: Region) -> OccupancySampler:
+    """A sampler for `silhouette`; the region is not empty."""
+    size = float((region.box[1] - region.box[0]).max())
+    return region.sampler(size / 100, resolution=128)
 
 
 @dataclass(frozen=True)
@@ -94,8 +106,8 @@ def old_ring(places: Places, index: int, frame: Frame, shadow: float, far: float
     ``shadow`` and ``far`` are the reach of the two dilations in image widths: around the objects' old masks, pixels
     beyond the first and within the second, where nothing moved in. An added object has its ring around its new place.
     """
-    was, now = (_union(p, index, frame) for p in (places.was, places.now))
-    added = _union(tuple(p for p in places.now if p.arrived_only), index, frame)
+    was, now = (united(p, index, frame) for p in (places.was, places.now))
+    added = united(tuple(p for p in places.now if p.arrived_only), index, frame)
     if was is None or now is None or added is None:
         return None
     width = frame.camera.width
@@ -103,8 +115,8 @@ def old_ring(places: Places, index: int, frame: Frame, shadow: float, far: float
     return torch.from_numpy(dilate(was | added, math.ceil(far * width)) & ~blocked)
 
 
-def _union(places: tuple[Place, ...], index: int, frame: Frame) -> np.ndarray | None:
-    """All the objects' masks in an old photo, (H, W); None if one is unsure."""
+def united(places: tuple[Place, ...], index: int | None, frame: Frame) -> np.ndarray | None:
+    """All the objects' masks in an old photo, (H, W), as of `Place.mask`; None if one is unsure."""
     total = np.zeros((frame.camera.height, frame.camera.width), bool)
     for place in places:
         mask = place.mask(index, frame)
