@@ -196,37 +196,59 @@ def _world(world: Path, work: Path) -> None:
 
 
 def _whole(data: Path, work: Path) -> None:
-    """Train and update from photos alone, by the command line; the change found against the true one."""
-    place = work / "whole"
+    """Train, update and measure by the command line, from photos alone and with their given poses."""
+    posed = {"before": data / "before", "after": data / "after", "eval": data / "eval"}
+    bare = {"before": data / "before" / "images", "after": data / "after" / "images", "eval": _unposed(data, work)}
+    rows: list[Row] = []
+    for title, parts in (("given", posed), ("withheld", bare)):
+        rows += [{"poses": title} | row for row in _all_the_way(parts, data, work / f"whole-{title}")]
+    _show("The whole way: train, update, evaluate", rows)
+
+
+def _unposed(data: Path, work: Path) -> Path:
+    """The evaluation photos and their masks, without poses."""
+    out = work / "eval-without-poses"
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(data / "eval", out, ignore=shutil.ignore_patterns("transforms.json"))
+    return out
+
+
+def _all_the_way(parts: dict[str, Path], data: Path, place: Path) -> list[Row]:
     shutil.rmtree(place, ignore_errors=True)
-    seconds = []
-    for command in (["train", data / "before" / "images", place], ["update", place, data / "after" / "images"]):
+    told: Row = {}
+    scores = place.with_suffix(".json")
+    for command in (
+        ["train", parts["before"], place],
+        ["update", place, parts["after"]],
+        ["evaluate", place, parts["eval"], "--out", scores],
+    ):
         began = time.perf_counter()
         code = refield([str(c) for c in command])
-        seconds.append(time.perf_counter() - began)
+        told[f"{command[0]}, s"] = time.perf_counter() - began
         if code != 0:
-            _show("The whole way", [{"command": command[0], "exit code": code, "seconds": seconds[-1]}])
-            return
+            return [told | {"exit code": code}]
+    found = json.loads(scores.read_text())
+    for name in ("psnr_in", "psnr_out", "psnr_untouched"):
+        told[name] = found["pooled"][name]
+        told[f"{name} before"] = found["pooled_before"][name]
     workspace = Workspace.open(place)
     capture, true = workspace.capture(), load_capture(data / "before")
-    names = sorted(p.name for p in (data / "before" / "images").iterdir())
-    here = [f for f in capture.frames]
-    # the workspace names photos by index; all were registered, or the pairing would not be known
-    if len(here) != len(names):
-        print(f"{len(here)} of {len(names)} photos registered: the change is not compared", flush=True)
-        return
-    there = {Path(f.name).name: f for f in true.frames}
-    known = between(here, [there[n] for n in names])
     change = workspace.change(1)
+    told |= {"old photos": len(capture.frames), "new photos": len(change.frames), "objects": len(change.objects)}
+    names = sorted(f.name for f in true.frames)
+    # the workspace names photos by index; if all were registered, it is known which is which
+    if len(capture.frames) != len(names):
+        return [told]
+    there = {f.name: f for f in true.frames}
+    known = between(capture.frames, [there[n] for n in names])
     rows: list[Row] = []
     for o in change.objects:
-        row: Row = {"kind": o.kind, "confidence": float(o.confidence), "note": o.note}
+        row: Row = {"kind": o.kind, "confidence": float(o.confidence)}
         row["centre, true units"] = ", ".join(f"{v:.2f}" for v in known.point(o.grid.tight_aabb().mean(0).double()))
         if o.new_from_old is not None:
             row |= _against_truth(known.motion(o.new_from_old), data)
-        rows.append(row)
-    used = f"{len(change.frames)} of {len(change.photos)} new photos placed"
-    _show(f"The whole way, from photos alone ({used}; train {seconds[0]:.0f} s, update {seconds[1]:.0f} s)", rows)
+        rows.append(told | row)
+    return rows or [told]
 
 
 def _against_truth(motion: torch.Tensor, data: Path) -> Row:

@@ -376,6 +376,16 @@ def test_photos_alone_all_the_way(reconstructed, tmp_path, monkeypatch, capsys):
     page = Path("work/visits/001/report.html").read_text()
     assert "black.png" in page and "points that agree" in page
 
+    (tmp_path / "eval").mkdir()
+    shutil.copytree("before", "eval/images")  # masks may be missing; photos without poses are placed like new ones
+    few = sorted(Path("eval/images").iterdir())
+    for path in few[2:]:
+        path.unlink()
+    assert main(["evaluate", "work", "eval", "--out", "scores.json", "--localize.features", "500"]) == 0
+    views = json.loads(Path("scores.json").read_text())["views"]
+    assert [v["name"] for v in views] == [path.name for path in few[:2]]
+    assert all(v["scores"]["psnr"] > 10 for v in views)
+
 
 def believe_photos(capture, field, frames, config, on_stage=None, models=None, known=()):
     """Nothing changed, and all photos were used."""

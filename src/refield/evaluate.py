@@ -111,11 +111,12 @@ def evaluate(
     folder: Path | str,
     *,
     old: Field | None = None,
+    frames: Sequence[Frame] | None = None,
     config: EvaluateConfig = EvaluateConfig(),
     on_view: Callable[[str], None] | None = None,
     perceptual: Perceptual | None = None,
 ) -> Report:
-    """Render every frame of ``folder/transforms.json`` and compare it with its image.
+    """Render every frame of ``folder/transforms.json``, or of ``frames``, and compare it with its image.
 
     ``folder`` also holds ``masks_in/`` and ``masks_out/``, PNGs with the images' stems. Either folder may be
     missing, and its scores are then None. ``old`` is scored on the same pixels; ``on_view`` hears each view's
@@ -126,7 +127,7 @@ def evaluate(
     """
     folder = Path(folder)
     views = []
-    for frame in load_transforms(folder).frames:
+    for frame in load_transforms(folder).frames if frames is None else frames:
         if on_view is not None:
             on_view(frame.name)
         views.append(_scored(_view(field, old, folder, frame, config), config, perceptual))

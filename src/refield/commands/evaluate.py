@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated
@@ -11,10 +12,15 @@ from tyro.conf import Positional, arg
 
 from refield.artefacts import writable
 from refield.commands.clock import Clock, results
+from refield.commands.placing import Placing, placed_photos
+from refield.estimate.localize import LocalizeConfig
 from refield.evaluate import EvaluateConfig, Report, Scores, evaluate
 from refield.history import state
+from refield.photos.taken import PhotoConfig
+from refield.scene.capture import Frame
 from refield.scene.errors import InputError
 from refield.scene.files import write_json
+from refield.scene.load import is_posed
 from refield.vision.perceptual import Perceptual, open_lpips
 from refield.vision.weights import WeightsError
 from refield.workspace import Workspace
@@ -27,13 +33,18 @@ class Evaluate:
     work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace"""
     eval: Annotated[Path, arg(metavar="EVAL"), Positional]
-    """a folder with transforms.json, images/, and masks_in/ and masks_out/ (PNGs with the images' names)"""
+    """a folder with images/, masks_in/ and masks_out/ (PNGs with the images' names), and transforms.json: without
+    it the photos are placed as new ones are"""
     visit: int | None = None
     """the state to measure: 0 is before any visit; the latest by default, beside the state before any"""
     out: Path | None = None
     """a JSON file for the numbers"""
     lpips: Path | None = None
     """a folder with the weights of AlexNet or VGG16 and of LPIPS (docs/weights.md); without them LPIPS is left out"""
+    intake: PhotoConfig = field(default_factory=PhotoConfig)
+    """photos without poses: how they are taken in"""
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    """photos without poses: how they are placed"""
     config: EvaluateConfig = field(default_factory=EvaluateConfig)
 
 
@@ -45,13 +56,24 @@ def run(options: Evaluate) -> None:
     clock.stage(f"load the field as of visit {visit}")
     now = state(workspace, visit)
     before = state(workspace, 0) if visit else None
-    clock.stage("evaluate")
-    report = evaluate(now, options.eval, old=before, config=options.config, perceptual=perceptual)
+    with contextlib.ExitStack() as held:
+        views = None if is_posed(options.eval) else _views(options, workspace, clock, held)
+        clock.stage("evaluate")
+        report = evaluate(now, options.eval, old=before, frames=views, config=options.config, perceptual=perceptual)
     clock.stop()
     if options.out is not None:
         with writable(options.out):
             write_json(options.out, report.to_dict())
     results().print(table(report, f"visit {visit}"))
+
+
+def _views(options: Evaluate, workspace: Workspace, clock: Clock, held: contextlib.ExitStack) -> list[Frame]:
+    """Photos without poses, in the workspace's world; their upright copies lie in its cache."""
+    held.enter_context(workspace.writing())
+    inner = options.eval / "images"
+    photos = inner if inner.is_dir() else options.eval  # masks are no photos
+    how = Placing(options.intake, options.localize)
+    return [p.frame for p in placed_photos(photos, workspace, clock, how) if p.frame is not None]
 
 
 def _opened(folder: Path | None) -> Perceptual | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -12,18 +12,17 @@ from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
 from refield.commands.page import page
-from refield.estimate.localize import LocalizeConfig, kept_landmarks, known_by, localize_photos
-from refield.estimate.models import Models
+from refield.commands.placing import Placing, placed_photos
+from refield.estimate.localize import LocalizeConfig
 from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.evaluate import Report, evaluate
 from refield.field.radiance import Field
 from refield.history import changed_visits, known_objects, retouched, state, untouched_psnr
 from refield.photos.taken import PhotoConfig
 from refield.report import summary, write_report
-from refield.scene.capture import Capture, Frame
+from refield.scene.capture import Capture
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
-from refield.scene.left_out import named
 from refield.scene.load import is_posed, load_new_photos
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
@@ -88,7 +87,11 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
     if is_posed(options.photos):
         given = load_new_photos(options.photos, workspace.capture(), warn=clock.warn)
     with workspace.writing(), tempfile.TemporaryDirectory(prefix="refield-") as scratch:
-        placed = _localized(options, workspace, models, clock) if given is None else _as_given(given)
+        if given is None:
+            how = Placing(options.intake, options.localize, models.describer)
+            placed = placed_photos(options.photos, workspace, clock, how)
+        else:
+            placed = [PlacedPhoto(frame.name, "used", frame=frame) for frame in given]
         frames = [photo.frame for photo in placed if photo.frame is not None]
         clock.stage("load the field")
         number = workspace.visits
@@ -113,31 +116,6 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
             report = page(title, change, (old, new), clock, evaluation, facts or {})
             write_report(folder, replace(report, world=workspace.world()))
     return Visit(workspace.visit(number + 1), change, evaluation)
-
-
-def _as_given(frames: Sequence[Frame]) -> list[PlacedPhoto]:
-    return [PlacedPhoto(frame.name, "used", frame=frame) for frame in frames]
-
-
-def _localized(options: Update, workspace: Workspace, models: Models, clock: Clock) -> list[PlacedPhoto]:
-    """The new photos in the capture's world; those that cannot be placed are told.
-
-    Raises:
-        InputError: none can be placed.
-    """
-    clock.stage("localize")
-    capture, cache = workspace.capture(), workspace.cache
-    with clock.counters() as counting:
-        landmarks = kept_landmarks(workspace.landmarks, capture, cache, counting)
-        known = known_by(capture, landmarks, models.describer, counting)
-        placed = localize_photos(options.photos, known, cache, options.localize, options.intake, counting)
-    rejected = [f"{photo.name} {photo.why}" for photo in placed if photo.frame is None]
-    if len(rejected) == len(placed):
-        what = f"none of its {len(placed)} photos can be placed ({named(rejected)})"
-        raise InputError(options.photos, what, "do they show the scene that was trained, in its light?")
-    for line in rejected:
-        clock.warn(f"left out: {line}")
-    return placed
 
 
 def _capture_now(workspace: Workspace, visit: int, now: Field, scratch: Path) -> Capture:

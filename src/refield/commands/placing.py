@@ -1,0 +1,46 @@
+"""Photos without poses, placed among those of a workspace."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from refield.commands.clock import Clock
+from refield.estimate.localize import LocalizeConfig, kept_landmarks, known_by, localize_photos
+from refield.photos.taken import PhotoConfig
+from refield.scene.change import PlacedPhoto
+from refield.scene.errors import InputError
+from refield.scene.left_out import named
+from refield.vision.describer import Describer
+from refield.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Placing:
+    """How photos without poses are taken in and placed."""
+
+    intake: PhotoConfig = field(default_factory=PhotoConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    describer: Describer | None = None
+    """which old photos look like a new one; None: VLAD of the capture's own features"""
+
+
+def placed_photos(folder: Path, workspace: Workspace, clock: Clock, how: Placing = Placing()) -> list[PlacedPhoto]:
+    """The photos of ``folder`` in the capture's world; those that cannot be placed are told. Call under the lock.
+
+    Raises:
+        InputError: none can be placed.
+    """
+    clock.stage("localize")
+    capture, cache = workspace.capture(), workspace.cache
+    with clock.counters() as counting:
+        landmarks = kept_landmarks(workspace.landmarks, capture, cache, counting)
+        known = known_by(capture, landmarks, how.describer, counting)
+        placed = localize_photos(folder, known, cache, how.localize, how.intake, counting)
+    rejected = [f"{photo.name} {photo.why}" for photo in placed if photo.frame is None]
+    if len(rejected) == len(placed):
+        what = f"none of its {len(placed)} photos can be placed ({named(rejected)})"
+        raise InputError(folder, what, "do they show the scene that was trained, in its light?")
+    for line in rejected:
+        clock.warn(f"left out: {line}")
+    return placed
