@@ -17,6 +17,7 @@ from torch import Tensor
 from refield.estimate.alone import object_alone
 from refield.estimate.consist import consistent
 from refield.estimate.detect import Changed, DetectConfig, Mask
+from refield.estimate.explain import explained_before
 from refield.estimate.hull import Hull, HullConfig, Plane, votes
 from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.layers import Sight
@@ -25,7 +26,7 @@ from refield.estimate.look import Array, View
 from refield.estimate.matched import matched_poses
 from refield.estimate.objects import Old
 from refield.estimate.outline import ObjectConfig, restricted
-from refield.estimate.past import Past, changed_share, gone_score, look_past
+from refield.estimate.past import Past, changed_share, gone_score, look_past, silhouette
 from refield.estimate.pose_change import COARSEST, FINER, PoseChange, RefineConfig, refine
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
 from refield.field.radiance import Field
@@ -47,6 +48,8 @@ class AssociateConfig:
     """worst registration score that is refined"""
     explains: float = 0.5
     """part of the object's pixels that the moved object must explain"""
+    shown: float = 0.8
+    """part of the object's pixels that the field shows right in old photos; if it is less, less need be explained"""
     gains: float = 0.15
     """by how much more than the old rendering did"""
     refined: int = 2
@@ -59,6 +62,8 @@ class AssociateConfig:
     """part of a photo that something new must fill in at least one of them (the paper's contour area, §10.2.2)"""
     trim: float = 0.03
     """part of an object's voxels that the new photos deny, from which on it is trimmed"""
+    core: float = 0.25
+    """part of an object's voxels that must remain when it is trimmed"""
     still: float = 1.2
     """pixels; what moved by less stayed"""
     most: int = 5
@@ -101,16 +106,28 @@ class Settled:
     """the old objects, those that were found again without what cannot be theirs"""
 
 
+@dataclass(frozen=True)
+class Fit:
+    """An old object found again."""
+
+    score: float
+    """of the registration, as `Candidate.score`"""
+    old: Old
+    """without what the photos show not to be at its new place"""
+    change: PoseChange
+
+
 def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> Settled:
     """Find each old object's new place or that it left, and what else arrived."""
     touched = [k for k, old in enumerate(olds) if changed_share(changed, old) >= ground.believe.touched]
     views = look_past(ground.field, changed, ground.survey, [olds[k] for k in touched], ground.detect)
     moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, views)
+    trimmed_some = any(placed[k] is not olds[k] for k in touched)
     olds = [placed.get(k, old) for k, old in enumerate(olds)]
     shares = {k: _gone(ground, views, olds[k]) for k in touched if k not in moved}
     removed = {k: share for k, share in shares.items() if share is not None}
     kept = [k for k in touched if k in moved or k in removed]
-    if len(kept) < len(touched):  # what never left hides what is behind it after all
+    if len(kept) < len(touched) or trimmed_some:  # what never left hides what is behind it after all
         views = look_past(ground.field, changed, ground.survey, [olds[k] for k in kept], ground.detect)
         for k, change in moved.items():
             views = take_off(ground.field, views, olds[k], change)
@@ -160,36 +177,31 @@ def _place_all(
     everyone = list(olds.values())
     while True:
         parts = newcomers(ground, arrivals(ground, views, everyone), views)[: ground.believe.most]
-        fits = {
+        tries = {
             k: best_fit(ground, olds[k], everyone, views, parts, extra)
             for k, extra in guesses.items()
             if k not in moved and parts
         }
-        found = [(score, k, change) for k, (score, change) in fits.items() if change is not None]
-        sure = sorted(found, key=lambda f: f[0])
-        if not sure:
+        fits = {k: fit for k, fit in tries.items() if fit is not None}
+        if not fits:
             return moved, views, olds
-        for k, change in _together(sure, olds, ground.search.enough):
-            olds[k], moved[k] = trimmed(ground, olds[k], everyone, views, change)
+        for k in _together(fits, ground.search.enough):
+            olds[k], moved[k] = fits[k].old, fits[k].change
             views = take_off(ground.field, views, olds[k], moved[k])
 
 
-def _together(
-    sure: Sequence[tuple[float, int, PoseChange]], olds: dict[int, Old], enough: float
-) -> list[tuple[int, PoseChange]]:
-    """Of objects that fit, best first: the first, and those that fit as well as can be at places of their own.
+def _together(fits: dict[int, Fit], enough: float) -> list[int]:
+    """Of objects that fit: the best, and those that fit as well as can be at places of their own.
 
     The others are looked for again when these are off the photos.
     """
-    taken: list[tuple[int, Tensor]] = []
-    out = []
-    for score, k, change in sure:
-        centre = transform(change.new_from_old, torch.from_numpy(olds[k].centre).double())
-        apart = [float((centre - c).norm()) > 0.8 * (olds[k].radius + olds[j].radius) for j, c in taken]
-        if not taken or (score <= enough and all(apart)):
-            taken.append((k, centre))
-            out.append((k, change))
-    return out
+    taken: dict[int, Tensor] = {}
+    for k, fit in sorted(fits.items(), key=lambda f: f[1].score):
+        centre = transform(fit.change.new_from_old, torch.from_numpy(fit.old.centre).double())
+        apart = [float((centre - c).norm()) > 0.8 * (fit.old.radius + fits[j].old.radius) for j, c in taken.items()]
+        if not taken or (fit.score <= enough and all(apart)):
+            taken[k] = centre
+    return list(taken)
 
 
 def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> Voxels:
@@ -314,8 +326,8 @@ def best_fit(
     past: Sequence[Past],
     parts: Sequence[Voxels],
     extra: Sequence[Tensor] = (),
-) -> tuple[float, PoseChange | None]:
-    """The pose change that best explains the photos with one old object, and its registration score.
+) -> Fit | None:
+    """The pose change that best explains the photos with one old object; None if none does.
 
     ``parts``: the arrivals' components, any of which it may be, or be in.
     """
@@ -336,17 +348,28 @@ def best_fit(
             best = change
     if best is not None:
         best = refine(sight, best.new_from_old, ground.fine, FINER)
-    if best is not None and (best.explained < believe.explains or best.explained < best.before + believe.gains):
-        best = None
-    return (found[0].score if found else 2.0), best
+    if best is None:
+        return None
+    old, best = trimmed(ground, old, olds, past, best)
+    least = believe.explains * min(1.0, shown_right(ground, old, past) / believe.shown)
+    if best.explained < least or best.explained < best.before + believe.gains:
+        return None
+    return Fit(found[0].score, old, best)
+
+
+def shown_right(ground: Ground, old: Old, past: Sequence[Past]) -> float:
+    """Part of an object's pixels in old photos that the old field shows as they are."""
+    threshold = float(np.median(np.concatenate([p.changed.threshold.ravel() for p in past])))
+    return explained_before([(v.photo, v.rgb, silhouette(v, old)) for v in ground.survey], threshold)
 
 
 def trimmed(
     ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past], change: PoseChange
 ) -> tuple[Old, PoseChange]:
-    """The object without what the photos show not to be at its new place (§10.2.4 on new photos).
+    """The object without what cannot be at its new place (§10.2.4 on new photos).
 
-    What no old view saw behind an object counts as solid; the new photos may look at its other side.
+    What no old view saw behind or beneath an object counts as solid. The new photos may look at its other side; and
+    nothing reaches into what holds things up.
     """
     places = old.lattice.centres[old.voxels]
     now = transform(change.new_from_old, torch.from_numpy(places)).numpy()
@@ -355,12 +378,17 @@ def trimmed(
         for p in past
     ]
     _, against = votes(now, seen, ground.carving)
-    if (against > 0).mean() < ground.believe.trim:
+    never = against > 0
+    for plane in ground.planes:
+        height, least = plane.height(now), max(0.25 * old.lattice.cell, plane.noise)
+        if (height < -2 * least).mean() >= ground.believe.trim:  # more than a pose that is not exact
+            never |= height < least
+    if never.mean() < ground.believe.trim:
         return old, change
     voxels = old.voxels.copy()
-    voxels[voxels] = against == 0
+    voxels[voxels] = ~never
     parts = components(voxels, 30)
-    if not parts or parts[0].sum() < 0.25 * len(places):
+    if not parts or parts[0].sum() < ground.believe.core * len(places):
         return old, change
     smaller = restricted(old, parts[0], ground.shape)
     again = refine(Sight(ground.field, smaller, past, olds), change.new_from_old, ground.fine)

@@ -57,6 +57,23 @@ def explained(photos: Sequence[Compared], sigma: float) -> Explained:
     return Explained(with_it / max(count, 1), without / max(count, 1), count)
 
 
+def explained_before(pictures: Sequence[tuple[Array, Array, NDArray[np.bool_]]], threshold: float) -> float:
+    """How much of an object's pixels in old photos show what the old field does there; 1 if none show the object.
+
+    No pose explains more: of a thing a few pixels wide the field shows hardly more than a blur.
+
+    Args:
+        pictures: photo (H, W, 3), the field's rendering of it, and the pixels (H, W) that show the object.
+        threshold: Lab difference from which on a pixel counts as changed.
+    """
+    right, count = 0, 0
+    for photo, rendering, here in pictures:
+        if here.any():
+            right += int((here & (pixels.colour_difference(photo, rendering, 1) < _LIMIT * threshold)).sum())
+            count += int(here.sum())
+    return right / count if count else 1.0
+
+
 def _relit(p: Compared, sigma: float) -> Array:
     """The composite with each side's smooth brightness taken from the photo: what turned is lit anew."""
     gain = np.ones((*p.sides.shape, 1), np.float32)
