@@ -115,7 +115,13 @@ class Layers:
 
     @cached_property
     def _behind(self) -> tuple[Tensor, Tensor]:
-        """Colour (N, 3) and depth (N,) without the objects."""
+        """Colour (N, 3) and depth (N,) without the objects; rendered, unless that was done at the same size."""
+        past = [self.sight.past[c.photo_index] for c in self.crops]
+        if all(p.view.camera == c.camera for p, c in zip(past, self.crops)):
+            cut = [(slice(c.box[1], c.box[3]), slice(c.box[0], c.box[2])) for c in self.crops]
+            rgb = np.concatenate([p.rgb[at].reshape(-1, 3) for p, at in zip(past, cut)])
+            depth = np.concatenate([p.depth[at].reshape(-1) for p, at in zip(past, cut)])
+            return torch.from_numpy(rgb), torch.from_numpy(depth)
         seen = see(self.sight.field, self._rays, Hidden(tuple(o.haze for o in self.sight.olds)))
         return seen.rgb, seen.depth
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import torch
@@ -55,6 +56,10 @@ class OccupancyGrid:
 
     def tight_aabb(self) -> Tensor:
         """(2, 3) box around the occupied nodes, half a cell wider; the grid's own box if none is occupied."""
+        return self._tight
+
+    @cached_property
+    def _tight(self) -> Tensor:
         points = self.occupied()
         if len(points) == 0:
             return self.aabb
