@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from refield.estimate.detect import Changed
-from refield.estimate.hull import HullConfig, find_region, support_planes
+from refield.estimate.hull import HullConfig, find_region
 from refield.estimate.lattice import Lattice, components
 from refield.estimate.look import median_depth, view_of
 from refield.field.volrend import Samples
+from refield.scene.planes import support_planes
 from tests.estimate.boxes import BoxWorld, camera_at, photograph, standing
 
 CRATE = standing((0.2, 0.17, 0.18), -0.1, -0.1, 20)

@@ -18,7 +18,7 @@ from refield.estimate.alone import object_alone
 from refield.estimate.consist import consistent
 from refield.estimate.detect import Changed, DetectConfig, Mask
 from refield.estimate.explain import explained_before
-from refield.estimate.hull import Hull, HullConfig, Plane, votes
+from refield.estimate.hull import Hull, HullConfig, votes
 from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.layers import Sight
 from refield.estimate.light import even_and_grey, log_ratio
@@ -30,6 +30,7 @@ from refield.estimate.past import Past, changed_share, gone_score, look_past, si
 from refield.estimate.pose_change import COARSEST, FINER, PoseChange, RefineConfig, refine
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
 from refield.field.radiance import Field
+from refield.scene.planes import Plane
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 from refield.vision.matcher import Matcher

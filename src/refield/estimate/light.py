@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from refield.estimate.detect import Changed, DetectConfig, Mask, blur_sigma
-from refield.estimate.hull import Plane
 from refield.estimate.look import Array, View
+from refield.scene.planes import Plane
 from refield.vision import pixels
 
 _DARK = 0.03  # linear light; below it a ratio is noise

@@ -14,13 +14,13 @@ import torch
 from scipy import ndimage
 
 from refield.estimate.carve_kernels import Window, find_solid, packed
-from refield.estimate.hull import Plane
 from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.look import spread_out
 from refield.estimate.objects import Old, Patch, corners_of, look_around, surface_cloud
 from refield.field.radiance import Field
 from refield.scene.capture import Frame
 from refield.scene.change import OccupancyGrid
+from refield.scene.planes import Plane
 from refield.vision import pixels
 from refield.vision.segmenter import Segmenter, cut_out
 

@@ -14,7 +14,7 @@ from refield.estimate.associate import AssociateConfig, Ground, Settled, looks_g
 from refield.estimate.conclude import Told, concluded, disagreeing
 from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.faces import changed_parts
-from refield.estimate.hull import Hull, HullConfig, Plane
+from refield.estimate.hull import Hull, HullConfig
 from refield.estimate.lattice import Lattice, Voxels, grown
 from refield.estimate.look import Array, View
 from refield.estimate.models import ModelConfig, Models
@@ -29,6 +29,7 @@ from refield.field.radiance import Field
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import OccupancyGrid, PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
+from refield.scene.planes import Plane, support_planes
 
 OnStage = Callable[[str], None]
 _OTHER_LIGHT = 2.0  # times brighter or darker, from which on a photo's light is spoken of
@@ -202,7 +203,7 @@ def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
     if len(points) < 50:
         return []
     for rough in (1, 2, 4):  # times what pixels resolve: a fitted surface may be uneven
-        planes = hull.support_planes(points, cameras, rough * 0.7 * float(np.median(sizes)))
+        planes = support_planes(points, cameras, rough * 0.7 * float(np.median(sizes)))
         if planes:
             return planes
     return []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +15,7 @@ from refield.field.losses import colour_loss, distortion_loss
 from refield.field.radiance import HashField
 from refield.field.volrend import Samples, accumulate_rgb
 from refield.scene.capture import Rays
+from refield.scene.planes import Plane
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.frozen import Segments, Woven, weave
@@ -47,11 +48,18 @@ class HelperTraining:
     """One run: the helper between fixed segments, until held-out pixels stop gaining."""
 
     def __init__(
-        self, helper: HashField, frozen: UpdatedField, sparse: Lit, old: Lit, judge: Lit, config: UpdateConfig
+        self,
+        helper: HashField,
+        frozen: UpdatedField,
+        sparse: Lit,
+        old: Lit,
+        judge: Lit,
+        config: UpdateConfig,
+        planes: Sequence[Plane] = (),
     ) -> None:
         self.helper, self.config, self.frozen = helper, config, frozen
         self.sparse, self.old, self.judge = sparse, old, judge
-        self.empty = emptiness(frozen.change, helper.sampler, frozen.bare)
+        self.empty = emptiness(frozen.change, helper.sampler, frozen.bare, planes)
         self.occupancy = HelperOccupancy(helper)
         self.adam = TableAdam(helper)
         self.rays_per_step, self.steps_done = 1024, 0

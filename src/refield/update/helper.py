@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
@@ -12,10 +15,12 @@ from refield.field.radiance import Field, HashField, HashFieldConfig
 from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Frame
 from refield.scene.change import SceneChange
+from refield.scene.planes import Plane
 from refield.update.region import Region
 
 _OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
 _WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
+_BAND = 2.5  # cells above what an object stood on that may hold its surface
 _DEPTH = 0.12  # of an object's mean side: so far inside, nothing that stood there can have been
 
 
@@ -43,11 +48,12 @@ def step_near(field: Field, point: Tensor) -> float:
     return s.step * max(reach, 1.0) ** 1.5
 
 
-def emptiness(change: SceneChange, cells: OccupancySampler, taken: Region) -> Tensor:
+def emptiness(change: SceneChange, cells: OccupancySampler, taken: Region, planes: Sequence[Plane] = ()) -> Tensor:
     """How deep inside an object that left each cell lies, (R**3,) float32: 0 outside and at its surface, 1 deep inside.
 
     What stood in the way of everything is not there any more; only near its surface may something else begin: the
-    ground under it, the wall behind it. 0 in ``taken`` too, where something stands now.
+    ground under it, the wall behind it. Where that is one of ``planes``, all above it is empty. 0 in ``taken``, where
+    something stands now.
     """
     r = cells.resolution
     depth = torch.zeros(r**3)
@@ -61,6 +67,10 @@ def emptiness(change: SceneChange, cells: OccupancySampler, taken: Region) -> Te
         cell = 4 * cells.contraction.radius / r
         distance = torch.from_numpy(distance_transform_edt(inside.numpy())).float().reshape(-1) * cell
         depth = torch.maximum(depth, (distance / reach - 1).clamp(0, 1))
+        touched = [p for p in planes if abs(float(np.quantile(p.height(o.grid.occupied().numpy()), 0.02))) < reach]
+        if touched:
+            above = [p.height(centres.numpy()) > max(_BAND * cell, 2 * p.noise) for p in touched]
+            depth[inside.reshape(-1) & torch.from_numpy(np.logical_and.reduce(above))] = 1.0
     return torch.where(taken.contains(centres), 0.0, depth) if taken.grids else depth
 
 

@@ -18,6 +18,7 @@ from refield.field.sampling import OccupancySampler
 from refield.field.warp import outline
 from refield.scene.capture import Capture, Frame, centres
 from refield.scene.change import SceneChange
+from refield.scene.planes import Plane
 from refield.scene.pose import transform
 from refield.update.bare import bare_skin
 from refield.update.composite import UpdatedField, leaving
@@ -25,6 +26,7 @@ from refield.update.config import UpdateConfig
 from refield.update.evidence import as_remembered, recalled_pixels
 from refield.update.fit_helper import HelperTraining, Lit, UpdateProgress
 from refield.update.frozen import composite_once
+from refield.update.ground import planes_around
 from refield.update.helper import new_helper, step_near
 from refield.update.light import Relighting, Sightings, fit_light
 from refield.update.recall import earlier_of
@@ -87,7 +89,11 @@ def update_field(
     say("supervise")
     region = _in_reach(wide.sampler(step_near(field, wide.box.mean(0))), capture.train + change.frames)
     # what earlier visits know has been taken from them already; of the rest no old photo shows anything
-    old = _old_lessons(capture, cut, region, config, light) if cut.to_learn.objects else known.sparse[:0]
+    old, planes = known.sparse[:0], list[Plane]()
+    if cut.to_learn.objects:
+        old, depth = _old_lessons(capture, cut, region, config, light)
+        around = old.rays.origins + old.rays.directions * depth[:, None]
+        planes = planes_around(around, wide.box, eyes, _pixel(change, wide.box.mean(0)))
     sparse = known.sparse[meets(region, known.sparse.rays).nonzero()[:, 0]]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
@@ -97,7 +103,7 @@ def update_field(
     old_taught = Lit(old, composite_once(frozen, region, old.rays))
     say("train")
     helper = new_helper(region, change.frames, config.seed)
-    run = HelperTraining(helper, frozen, new_taught, old_taught, judge, config)
+    run = HelperTraining(helper, frozen, new_taught, old_taught, judge, config, planes)
     run.run(on_progress)
     say("show")
     helper.requires_grad_(False)
@@ -194,8 +200,8 @@ def _shading(sparse: Lessons, cut: UpdatedField, change: SceneChange) -> tuple[R
 
 def _old_lessons(
     capture: Capture, cut: UpdatedField, region: OccupancySampler, config: UpdateConfig, light: Relighting | None
-) -> Lessons:
-    """Ring pixels of the old photos whose rays meet the region, in the new light."""
+) -> tuple[Lessons, Tensor]:
+    """Ring pixels of the old photos whose rays meet the region, in the new light, and the depth (N,) they show."""
     bank, places = PixelBank(capture.train), places_of(cut.change)
     chosen = []
     for i, frame in enumerate(capture.train):
@@ -206,7 +212,7 @@ def _old_lessons(
     pixels = pixels[meets(region, bank.rays(pixels)).nonzero()[:, 0]]
     pixels = pixels[torch.randperm(len(pixels))[:_RING_RAYS]].sort().values
     rays, rgb = bank.rays(pixels), bank.colours(pixels)
+    was = render_many(cut.pretrained, rays)
     if light is not None:
-        was = render_many(cut.pretrained, rays)
         rgb = light.applied(rays.origins + rays.directions * was.depth[:, None], rgb)
-    return Lessons(rays, rgb, torch.full((len(rgb),), -1))
+    return Lessons(rays, rgb, torch.full((len(rgb),), -1)), was.depth
