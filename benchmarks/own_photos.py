@@ -1,8 +1,9 @@
 """Photos alone: how well structure from motion finds their poses, and localization those of new ones.
 
     python benchmarks/own_photos.py --data DATA                   # real photographs: DATA/fox
-    python benchmarks/own_photos.py --data DATA --whole           # DATA/fox_moved all the way, train and update
+    python benchmarks/own_photos.py --data DATA --whole           # DATA/fox_moved all the way: train, update, evaluate
     python benchmarks/own_photos.py --world FOLDER [FOLDER …]     # what `refield synth` wrote, poses withheld
+    python benchmarks/own_photos.py --whole --world FOLDER …      # the same all the way
 
 Prints one table per section, in Markdown, with date, machine and command. What takes long is kept in ``--work``.
 "the scene" is the largest distance between two cameras.
@@ -32,6 +33,7 @@ from refield.photos.capture import FromPhotos, capture_from_photos
 from refield.photos.gather import gather
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import PlacedPhoto
+from refield.scene.change_files import load_change
 from refield.scene.images import read_image, write_image
 from refield.scene.load import load_capture
 from refield.scene.pose import angle_between, transform
@@ -48,7 +50,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with fox/ and fox_moved/ (real photographs)")
     parser.add_argument("--world", type=Path, nargs="*", default=[], help="folders that `refield synth` wrote")
-    parser.add_argument("--whole", action="store_true", help="only train and update fox_moved, from photos alone")
+    parser.add_argument("--whole", action="store_true", help="only train, update and evaluate fox_moved, or the worlds")
     parser.add_argument(
         "--work", type=Path, default=Path("build/own-photos"), help="where intermediate things are kept"
     )
@@ -56,6 +58,10 @@ def main() -> int:
     print(_conditions())
     if options.data is not None and options.whole:
         _whole(options.data / "fox_moved", options.work)
+    elif options.world and options.whole:
+        for world in options.world:
+            _whole(world, options.work / f"world-{world.name}")
+        return 0
     elif options.data is not None:
         found = _motion("fox", options.data / "fox" / "images", options.data / "fox", options.work / "fox")
         _localization(options.data / "fox" / "images", found, options.work)
@@ -202,7 +208,7 @@ def _whole(data: Path, work: Path) -> None:
     rows: list[Row] = []
     for title, parts in (("given", posed), ("withheld", bare)):
         rows += [{"poses": title} | row for row in _all_the_way(parts, data, work / f"whole-{title}")]
-    _show("The whole way: train, update, evaluate", rows)
+    _show(f"{data.name} the whole way: train, update, evaluate", rows)
 
 
 def _unposed(data: Path, work: Path) -> Path:
@@ -252,12 +258,34 @@ def _all_the_way(parts: dict[str, Path], data: Path, place: Path) -> list[Row]:
 
 
 def _against_truth(motion: torch.Tensor, data: Path) -> Row:
-    (true,) = json.loads((data / "truth.json").read_text())
-    expected = torch.tensor(true["T"], dtype=torch.float64)
-    centre = torch.tensor(true["centre"], dtype=torch.float64)  # where it was
+    """A pose change in the true world beside the nearest true one."""
+    found = [_off(motion, *true) for true in _true_motions(data)]
+    return min(found, key=lambda row: float(row["off, % of its size"])) if found else {}
+
+
+def _off(motion: torch.Tensor, expected: torch.Tensor, centre: torch.Tensor, wide: float) -> Row:
     away = float((transform(motion, centre) - transform(expected, centre)).norm())
-    wide = 2 * max(true["half_size"])
-    return {"off, % of its size": 100 * away / wide, "off, °": float(angle_between(motion, expected))}
+    return {
+        "off, units": away,
+        "off, % of its size": 100 * away / wide,
+        "off, °": float(angle_between(motion, expected)),
+    }
+
+
+def _true_motions(data: Path) -> list[tuple[torch.Tensor, torch.Tensor, float]]:
+    """Of each object that moved: the true T, its old centre, its largest extent."""
+    if (data / "truth").is_dir():
+        moved = [o for o in load_change(data / "truth").objects if o.new_from_old is not None]
+        boxes = [o.grid.tight_aabb().double() for o in moved]
+        return [(o.new_from_old, b.mean(0), float((b[1] - b[0]).max())) for o, b in zip(moved, boxes)]
+    return [
+        (
+            torch.tensor(t["T"], dtype=torch.float64),
+            torch.tensor(t["centre"], dtype=torch.float64),
+            2 * max(t["half_size"]),
+        )
+        for t in json.loads((data / "truth.json").read_text())
+    ]
 
 
 if __name__ == "__main__":
