@@ -17,7 +17,6 @@ import re
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -121,7 +120,7 @@ def _lab(options: argparse.Namespace) -> Lab:
     return Lab(
         Kept(options.out / other),
         FitConfig(steps=options.steps),
-        replace(UpdateConfig(), steps=options.update_steps),
+        UpdateConfig(steps=options.update_steps, max_seconds=600.0),  # a busy machine must not change what is found
         None if options.lpips is None else open_lpips(options.lpips),
         None if options.lama is None else Lama(options.lama),
         options.looks,

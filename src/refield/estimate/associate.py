@@ -16,6 +16,7 @@ from torch import Tensor
 
 from refield.estimate.alone import object_alone
 from refield.estimate.consist import consistent
+from refield.estimate.detail import Detail, detail_of
 from refield.estimate.detect import Changed, DetectConfig, Mask
 from refield.estimate.explain import explained_before
 from refield.estimate.hull import Hull, HullConfig, votes
@@ -30,6 +31,7 @@ from refield.estimate.past import Past, changed_share, gone_score, look_past, si
 from refield.estimate.pose_change import COARSEST, FINER, PoseChange, RefineConfig, refine
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
 from refield.field.radiance import Field
+from refield.scene.capture import Frame
 from refield.scene.planes import Plane
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
@@ -84,6 +86,8 @@ class Ground:
     planes: Sequence[Plane]
     """what holds things up"""
     survey: Sequence[View]
+    photographed: Sequence[Frame]
+    """old photos that show the old state as it was"""
     detect: DetectConfig
     carving: HullConfig
     shape: ObjectConfig
@@ -348,14 +352,22 @@ def best_fit(
         if change is not None and (best is None or change.explained > best.explained + 0.02):
             best = change
     if best is not None:
+        sight = replace(sight, detail=_detail(ground, old, past, best.new_from_old))
         best = refine(sight, best.new_from_old, ground.fine, FINER)
     if best is None:
         return None
-    old, best = trimmed(ground, old, olds, past, best)
+    old, best = trimmed(ground, sight, best)
     least = believe.explains * min(1.0, shown_right(ground, old, past) / believe.shown)
     if best.explained < least or best.explained < best.before + believe.gains:
         return None
     return Fit(found[0].score, old, best)
+
+
+def _detail(ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor) -> Detail | None:
+    fine, views = ground.fine, [p.view for p in past]
+    if fine.detail == 0 or not ground.photographed:
+        return None
+    return detail_of(ground.field, old, ground.photographed, views, new_from_old, fine.detail, fine.detail_rays)
 
 
 def shown_right(ground: Ground, old: Old, past: Sequence[Past]) -> float:
@@ -364,14 +376,13 @@ def shown_right(ground: Ground, old: Old, past: Sequence[Past]) -> float:
     return explained_before([(v.photo, v.rgb, silhouette(v, old)) for v in ground.survey], threshold)
 
 
-def trimmed(
-    ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past], change: PoseChange
-) -> tuple[Old, PoseChange]:
+def trimmed(ground: Ground, sight: Sight, change: PoseChange) -> tuple[Old, PoseChange]:
     """The object without what cannot be at its new place (§10.2.4 on new photos).
 
     What no old view saw behind or beneath an object counts as solid. The new photos may look at its other side; and
     nothing reaches into what holds things up.
     """
+    old, past = sight.old, sight.past
     places = old.lattice.centres[old.voxels]
     now = transform(change.new_from_old, torch.from_numpy(places)).numpy()
     seen = [
@@ -392,7 +403,7 @@ def trimmed(
     if not parts or parts[0].sum() < ground.believe.core * len(places):
         return old, change
     smaller = restricted(old, parts[0], ground.shape)
-    again = refine(Sight(ground.field, smaller, past, olds), change.new_from_old, ground.fine)
+    again = refine(replace(sight, old=smaller), change.new_from_old, ground.fine)
     return (old, change) if again is None or again.explained <= change.explained - 0.02 else (smaller, again)
 
 

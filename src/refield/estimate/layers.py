@@ -17,6 +17,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from refield.estimate.alone import object_alone, sampler_around
+from refield.estimate.detail import Detail
 from refield.estimate.explain import Compared
 from refield.estimate.look import Hidden, load_photo, pixel_slopes, see
 from refield.estimate.objects import Old, box_in, patch_rays
@@ -39,6 +40,8 @@ class Sight:
     past: Sequence[Past]
     olds: Sequence[Old]
     """all objects that are taken out of the old field"""
+    detail: Detail | None = None
+    """what the field's pictures of the object lack"""
 
 
 @dataclass(frozen=True)
@@ -132,9 +135,24 @@ class Layers:
         front = ((beyond - alone.depth) > -self.pixel * 2) & (alone.opacity > 0.02)
         opacity = torch.where(front, alone.opacity, torch.zeros_like(alone.opacity))
         own = torch.where(front[:, None], alone.rgb, torch.zeros_like(alone.rgb))
+        if self.sight.detail is not None:
+            own = own + self._lacking(self.sight.detail, opacity, alone.depth, new_from_old)
         rgb = own + (1 - opacity)[:, None] * behind
         parts = (t.split(self._sizes) for t in (rgb, own, opacity, alone.depth, behind))
         return [Layer(*p) for p in zip(*parts)]
+
+    def _lacking(self, detail: Detail, opacity: Tensor, depth: Tensor, new_from_old: Tensor) -> Tensor:
+        """The detail at each pixel (N, 3), premultiplied, as each new photo sees it."""
+        out, start = torch.zeros(len(depth), 3), 0
+        back = invert(new_from_old)
+        for crop in self.crops:
+            at = slice(start, start + len(crop.rays))
+            start = at.stop
+            solid = ((opacity[at] > 0.5) & torch.isfinite(depth[at])).nonzero()[:, 0]
+            x = crop.rays.origins[solid] + crop.rays.directions[solid] * depth[at][solid, None]
+            lacking = detail.at(transform(back, x), transform(back, crop.world_from_cam[:3, 3]))
+            out[at][solid] = lacking * opacity[at][solid, None]
+        return out
 
     def sides(self, crop: Crop, shown: Layer, new_from_old: Tensor) -> NDArray[np.int64]:
         """The side of the object at each pixel (n,); -1 where it is not, or no old photo saw what is there."""

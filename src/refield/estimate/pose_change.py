@@ -43,6 +43,10 @@ class RefineConfig:
     """this part of what light may explain is put down to it; the rest holds objects without texture"""
     robust: float = 0.1
     """colour error, in [0, 1] RGB, beyond which a pixel counts less"""
+    detail: int = 3
+    """old photos that each new one takes texture from that the field has not learnt, in the finest refinement"""
+    detail_rays: int = 80_000
+    """over those old photos; they are scaled down to keep to it"""
     unseen: float = 0.02
     """a turn is unobservable if the photos hold it this much less than a shift of the same size"""
 

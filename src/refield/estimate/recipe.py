@@ -127,8 +127,9 @@ def estimate_change(
     olds = _were_there(scene, carved, things or others)
     say("pose")
     up = scene.planes[0].normal if scene.planes else _up(capture)
+    photographed = [f for f in capture.frames if f.made is None]
     ground = Ground(
-        field, carved, free, up, scene.planes, scene.survey, config.detect, config.hull, config.objects,
+        field, carved, free, up, scene.planes, scene.survey, photographed, config.detect, config.hull, config.objects,
         config.associate, config.register, config.refine, models.matcher,
     )  # fmt: skip
     settled = associate.settle(ground, olds, scene.changed)

@@ -1,0 +1,88 @@
+"""What old photos show of an object beyond what the field does: texture finer than the field has learnt.
+
+A pose is found by comparing photos with pictures of the field, and is no more exact than those. What these lack
+beside the old photos is carried along with the object's surface, from photos that looked at it as the new ones do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from refield.estimate.look import Array, View, load_photo
+from refield.estimate.objects import Old, Patch, corners_of, look_around
+from refield.field.radiance import Field
+from refield.scene.capture import Frame
+from refield.scene.pose import invert, transform
+
+_SAME = 2.0  # pixels' widths; what lies this close to the surface that an old photo shows is on it
+_STRAIGHT = 4  # power of the cosine between two looks with which the older one counts
+_LEAST = 1e-3  # of such weight, to say anything
+
+
+@dataclass(frozen=True)
+class Detail:
+    """What the field's pictures of an object lack beside some old photos."""
+
+    patches: tuple[Patch, ...]
+    missing: tuple[Array, ...]
+    """per patch (h, w, 3): the photo less the field's picture"""
+
+    def at(self, points: Tensor, eye: Tensor) -> Tensor:
+        """What the field lacks at surface points (N, 3) of the object at its old place, seen from ``eye`` (3,) there;
+        (N, 3), zero where no old photo tells."""
+        x = points.float()
+        look = functional.normalize(x - eye.float(), dim=-1)
+        total, weight = torch.zeros(len(x), 3), torch.zeros(len(x))
+        for patch, missing in zip(self.patches, self.missing):
+            m = patch.frame.world_from_cam
+            before = x - m[:3, 3].float()
+            uv, z = patch.camera.project(before @ m[:3, :3].float())
+            at = (uv - torch.tensor(patch.box[:2]) - 0.5).numpy().astype(np.float32)
+            h, w = patch.depth.shape
+            inside = (z > 0).numpy() & (at > -0.5).all(-1) & (at[:, 0] < w - 0.5) & (at[:, 1] < h - 0.5)
+            at = np.where(inside[:, None], at, 0)
+            near = np.rint(at).astype(np.int64)
+            distance = before.norm(dim=-1)
+            off = np.abs(patch.depth[near[:, 1], near[:, 0]] - distance.numpy())
+            shown = torch.from_numpy(inside & (off < _SAME / patch.camera.fx * distance.numpy()))
+            straight = (look * before).sum(-1) / distance.clamp_min(1e-9)
+            counts = shown * straight.clamp_min(0) ** _STRAIGHT
+            seen = cv2.remap(missing, at[:, 0], at[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            total += counts[:, None] * torch.from_numpy(seen.reshape(-1, 3))
+            weight += counts
+        return torch.where((weight > _LEAST)[:, None], total / weight.clamp_min(_LEAST)[:, None], 0.0)
+
+
+def detail_of(
+    field: Field, old: Old, frames: Sequence[Frame], views: Sequence[View], new_from_old: Tensor, each: int, rays: int
+) -> Detail:
+    """The detail that ``views`` (new photos) need of an object that ``new_from_old`` moves.
+
+    Args:
+        frames: old photos, of which ``each`` new one takes so many.
+        rays: looked along in all; more are avoided by scaling the photos down.
+    """
+    middle = torch.from_numpy(old.centre).double()
+    ways = functional.normalize(torch.stack([f.centre for f in frames]).double() - middle, dim=-1)
+    chosen: set[int] = set()
+    for view in views:
+        eye = transform(invert(new_from_old), view.frame.centre.double())
+        alike = ways @ functional.normalize(eye - middle, dim=-1)
+        chosen.update(alike.topk(min(each, len(frames))).indices.tolist())
+    low, high = old.grid.tight_aabb().numpy()
+    patches = look_around(field, [frames[k] for k in sorted(chosen)], corners_of(low, high), rays)
+    return Detail(tuple(patches), tuple(_missing(p) for p in patches))
+
+
+def _missing(patch: Patch) -> Array:
+    """The photo less the field's picture, but for what its whole exposure explains."""
+    x0, y0, x1, y1 = patch.box
+    left = load_photo(patch.frame, patch.camera)[y0:y1, x0:x1] - patch.rgb
+    return np.ascontiguousarray(left - np.median(left.reshape(-1, 3), axis=0), np.float32)
