@@ -60,7 +60,7 @@ class AssociateConfig:
     gone: float = 0.45
     """part of an object's pixels that must show what was behind it, for it to have left"""
     arrived: float = 0.5
-    """part of a newcomer's pixels that nothing else explains"""
+    """part of a newcomer's pixels that nothing else explains; of a moved object's, that do not show what was there"""
     newcomer: float = 0.01
     """part of a photo that something new must fill in at least one of them (the paper's contour area, §10.2.2)"""
     trim: float = 0.03
@@ -358,7 +358,7 @@ def best_fit(
         return None
     old, best = trimmed(ground, sight, best)
     least = believe.explains * min(1.0, shown_right(ground, old, past) / believe.shown)
-    if best.explained < least or best.explained < best.before + believe.gains:
+    if best.explained < max(least, best.before + believe.gains) or best.before > 1 - believe.arrived:
         return None
     return Fit(found[0].score, old, best)
 
