@@ -148,3 +148,9 @@ def test_a_moved_object_is_rendered_as_the_moved_world_shows_it(stage):
     sure = (alone.opacity > 0.95).reshape(view.shape)
     apart = (rgb.reshape(*view.shape, 3) - truth.rgb).abs().amax(-1)[sure]
     assert len(apart) > 100 and float(apart.median()) < 0.05
+
+
+def test_an_object_behind_everything_is_not_shown_and_breaks_nothing(stage):
+    hidden = [replace(p, depth=np.full_like(p.depth, 0.01)) for p in stage.past]
+    found = refine(Sight(BEFORE, stage.old, hidden, [stage.old]), TRUE)
+    assert found is None or found.explained == 0

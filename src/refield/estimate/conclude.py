@@ -174,10 +174,10 @@ def _shown_in(sight: Sight, new_from_old: Tensor) -> dict[int, Tensor]:
     """The moved object's outline in each photo that shows it, by the photo's index, (H, W) bool."""
     ready = layers_at(sight, new_from_old, _MASK_RAYS)
     out = {}
-    for crop, shown in zip(ready.crops, ready.show(new_from_old)):
+    for crop, opacity in zip(ready.crops, ready.cover(new_from_old)):
         x0, y0, x1, y1 = crop.box
         full: Array = np.zeros((crop.camera.height, crop.camera.width), np.float32)
-        full[y0:y1, x0:x1] = shown.opacity.reshape(crop.shape).numpy()
+        full[y0:y1, x0:x1] = opacity.reshape(crop.shape).numpy()
         camera = sight.past[crop.photo_index].view.frame.camera
         if (camera.width, camera.height) != (crop.camera.width, crop.camera.height):
             full = cv2.resize(full, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)

@@ -19,7 +19,7 @@ from torch import Tensor
 from refield.estimate.alone import object_alone, sampler_around
 from refield.estimate.detail import Detail
 from refield.estimate.explain import Compared
-from refield.estimate.look import Hidden, load_photo, pixel_slopes, see
+from refield.estimate.look import Hidden, Seen, load_photo, pixel_slopes, see
 from refield.estimate.objects import Old, box_in, patch_rays
 from refield.estimate.past import Past
 from refield.field.radiance import Field
@@ -62,6 +62,8 @@ class Crop:
     """(n,) whether what is behind was seen by old photos"""
     threshold: Tensor
     """(n,) Lab units"""
+    beyond: Tensor
+    """(n,) how far away what stands there without the object is, no finer than the working size"""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -132,7 +134,7 @@ class Layers:
         """The moved object over the fixed background, per crop (Eqs. 1, 3)."""
         alone = object_alone(self.sight.field, self.old, self._rays, new_from_old, self._sampler)
         behind, beyond = self._behind
-        front = ((beyond - alone.depth) > -self.pixel * 2) & (alone.opacity > 0.02)
+        front = self._in_front(alone, beyond)
         opacity = torch.where(front, alone.opacity, torch.zeros_like(alone.opacity))
         own = torch.where(front[:, None], alone.rgb, torch.zeros_like(alone.rgb))
         if self.sight.detail is not None:
@@ -140,6 +142,15 @@ class Layers:
         rgb = own + (1 - opacity)[:, None] * behind
         parts = (t.split(self._sizes) for t in (rgb, own, opacity, alone.depth, behind))
         return [Layer(*p) for p in zip(*parts)]
+
+    def cover(self, new_from_old: Tensor) -> list[Tensor]:
+        """The moved object's opacity (n,) per crop, where it is in front; nothing but the object is rendered."""
+        alone = object_alone(self.sight.field, self.old, self._rays, new_from_old, self._sampler)
+        front = self._in_front(alone, torch.cat([c.beyond for c in self.crops]))
+        return list(torch.where(front, alone.opacity, 0.0).split(self._sizes))
+
+    def _in_front(self, alone: Seen, beyond: Tensor) -> Tensor:
+        return ((beyond - alone.depth) > -self.pixel * 2) & (alone.opacity > 0.02)
 
     def _lacking(self, detail: Detail, opacity: Tensor, depth: Tensor, new_from_old: Tensor) -> Tensor:
         """The detail at each pixel (N, 3), premultiplied, as each new photo sees it."""
@@ -234,4 +245,5 @@ def _crop(index: int, p: Past, camera: Camera, box: tuple[int, int, int, int]) -
         torch.from_numpy(photo.reshape(-1, 3)),
         torch.from_numpy(p.known[pick].reshape(-1)),
         torch.from_numpy(p.changed.threshold[pick].reshape(-1)),
+        torch.from_numpy(p.depth[pick].reshape(-1)),
     )

@@ -174,6 +174,8 @@ def _descend(
     now = residuals(ready, pose, sigma, c)
     for _ in range(steps):
         hessian, gradient = now.normal(c.robust, unit)
+        if not hessian.trace() > 0:  # the object is behind other things in every photo
+            break
         cost, better = now.cost(c.robust), False
         for _ in range(3):
             damped = hessian + torch.diag(damping * hessian.diagonal() + 1e-6 * hessian.trace())

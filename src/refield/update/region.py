@@ -10,7 +10,7 @@ from torch import Tensor
 
 from refield.field.encoding import Contraction
 from refield.field.sampling import OccupancySampler
-from refield.field.warp import inside_box, outline
+from refield.field.warp import crossing, inside_box, outline
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
 
@@ -63,9 +63,13 @@ class Region:
 
 
 def meets(sampler: OccupancySampler, rays: Rays) -> Tensor:
-    """Whether each of N rays passes an occupied cell, (N,) bool."""
-    parts = [sampler(rays[i : i + _CHUNK]) for i in range(0, max(len(rays), 1), _CHUNK)]
-    return torch.cat([p.ray_offsets.diff() for p in parts]) > 0
+    """Whether each of N rays passes an occupied cell, (N,) bool. The sampler is one of `Region.sampler`."""
+    space = sampler.contraction
+    near, far = crossing(rays, torch.stack([space.centre - space.radius, space.centre + space.radius]))
+    out = far > near  # the core cube, beyond which there is no region
+    for rows in out.nonzero()[:, 0].split(_CHUNK):
+        out[rows] = sampler(rays[rows]).ray_offsets.diff() > 0
+    return out
 
 
 def move_out(change: SceneChange, factor: float) -> Region:
