@@ -170,3 +170,17 @@ def test_voxels_grow(rng, steps):
             cube = np.ones((3, 3, 3), bool)
             expected = ndimage.binary_dilation(voxels, cube, iterations=max(steps, 0), mask=within) if steps else voxels
             np.testing.assert_array_equal(grown(voxels, steps, within), expected)
+
+
+def test_points_are_held_by_the_voxel_they_round_to():
+    rng = np.random.default_rng(4)
+    lattice = Lattice(np.array([-0.3, 0.1, 0.2], np.float32), 0.04, (9, 7, 5))
+    voxels = rng.random(lattice.shape) < 0.5
+    points = (lattice.low + lattice.cell * rng.uniform(-2, 11, (4000, 3))).astype(np.float32)
+    points[:3] = [[np.nan, 0, 0], [np.inf, 0, 0], [0, -np.inf, 0]]
+    ijk, inside = lattice.index(points)
+    expected = inside & voxels[tuple(ijk.T)]
+    real = np.isfinite(points).all(-1)
+    clear = ~real  # of the border between two voxels, where rounding decides
+    clear[real] = np.abs((points[real] - lattice.low) / lattice.cell % 1 - 0.5).min(-1) > 1e-3
+    assert expected.any() and (lattice.holds(voxels, points) == expected)[clear].all()

@@ -49,6 +49,7 @@ def test_nothing_is_said_where_no_old_photo_looks(tmp_path):
     assert (detail.at(torch.tensor([beside, above, beneath]), eye) == 0).all()
     assert (detail.at(torch.tensor([[0.1, 0.0, 0.0]]), torch.tensor([0.0, 0.0, -2.0])) == 0).all()  # from behind
     assert (Detail((), ()).at(torch.zeros(2, 3), eye) == 0).all()
+    assert detail.at(torch.zeros(0, 3), eye).shape == (0, 3)
 
 
 def test_the_photo_that_looked_from_there_counts_most(tmp_path):

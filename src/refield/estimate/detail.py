@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -40,24 +39,29 @@ class Detail:
         x = points.float()
         look = functional.normalize(x - eye.float(), dim=-1)
         total, weight = torch.zeros(len(x), 3), torch.zeros(len(x))
+        if len(x) == 0:
+            return total
         for patch, missing in zip(self.patches, self.missing):
-            m = patch.frame.world_from_cam
-            before = x - m[:3, 3].float()
-            uv, z = patch.camera.project(before @ m[:3, :3].float())
-            at = (uv - torch.tensor(patch.box[:2]) - 0.5).numpy().astype(np.float32)
-            h, w = patch.depth.shape
-            inside = (z > 0).numpy() & (at > -0.5).all(-1) & (at[:, 0] < w - 0.5) & (at[:, 1] < h - 0.5)
-            at = np.where(inside[:, None], at, 0)
-            near = np.rint(at).astype(np.int64)
-            distance = before.norm(dim=-1)
-            off = np.abs(patch.depth[near[:, 1], near[:, 0]] - distance.numpy())
-            shown = torch.from_numpy(inside & (off < _SAME / patch.camera.fx * distance.numpy()))
-            straight = (look * before).sum(-1) / distance.clamp_min(1e-9)
+            where, inside = patch.pixel_of(x)
+            before = x - torch.from_numpy(patch.centre)
+            distance = before.norm(dim=-1).clamp_min(1e-9)
+            off = (torch.from_numpy(patch.depth).reshape(-1)[where] - distance).abs()
+            straight = (look * before).sum(-1) / distance
+            shown = inside & (off < _SAME / patch.camera.fx * distance)
             counts = shown * straight.clamp_min(0) ** _STRAIGHT
-            seen = cv2.remap(missing, at[:, 0], at[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            total += counts[:, None] * torch.from_numpy(seen.reshape(-1, 3))
+            total += counts[:, None] * _looked_up(missing, patch, x)
             weight += counts
         return torch.where((weight > _LEAST)[:, None], total / weight.clamp_min(_LEAST)[:, None], 0.0)
+
+
+def _looked_up(missing: Array, patch: Patch, x: Tensor) -> Tensor:
+    """The picture's value (N, 3) where world points (N, 3) project to, bilinear."""
+    m = patch.frame.world_from_cam
+    uv, _ = patch.camera.project((x - m[:3, 3].float()) @ m[:3, :3].float())
+    h, w = patch.depth.shape
+    unit = (uv - torch.tensor(patch.box[:2])) / torch.tensor([w, h]) * 2 - 1
+    image, at = torch.from_numpy(missing).permute(2, 0, 1)[None], unit[None, :, None]
+    return functional.grid_sample(image, at, padding_mode="border", align_corners=False)[0, :, :, 0].T
 
 
 def detail_of(
