@@ -31,13 +31,14 @@ from refield.cli import main as refield
 from refield.estimate.localize import Known, localize, localize_photos
 from refield.photos.capture import FromPhotos, capture_from_photos
 from refield.photos.gather import gather
+from refield.photos.sources import find_sources
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import PlacedPhoto
 from refield.scene.change_files import load_change
 from refield.scene.images import read_image, write_image
-from refield.scene.load import load_capture
+from refield.scene.load import is_posed, load_capture
 from refield.scene.pose import angle_between, transform
-from refield.scene.similarity import between, pose_errors
+from refield.scene.similarity import Similarity, between, pose_errors
 from refield.scene.transforms_json import load_transforms
 from refield.scene.world import world_of
 from refield.synthetic import sample_folder
@@ -241,12 +242,9 @@ def _all_the_way(parts: dict[str, Path], data: Path, place: Path) -> list[Row]:
     capture, true = workspace.capture(), load_capture(data / "before")
     change = workspace.change(1)
     told |= {"old photos": len(capture.frames), "new photos": len(change.frames), "objects": len(change.objects)}
-    names = sorted(f.name for f in true.frames)
-    # the workspace names photos by index; if all were registered, it is known which is which
-    if len(capture.frames) != len(names):
+    known = _to_true(capture, true, parts["before"])
+    if known is None:
         return [told]
-    there = {f.name: f for f in true.frames}
-    known = between(capture.frames, [there[n] for n in names])
     rows: list[Row] = []
     for o in change.objects:
         row: Row = {"kind": o.kind, "confidence": float(o.confidence)}
@@ -255,6 +253,19 @@ def _all_the_way(parts: dict[str, Path], data: Path, place: Path) -> list[Row]:
             row |= _against_truth(known.motion(o.new_from_old), data)
         rows.append(told | row)
     return rows or [told]
+
+
+def _to_true(capture: Capture, true: Capture, given: Path) -> Similarity | None:
+    """From the workspace's world to the true one; None if it is not known which photo is which."""
+    frames = list(true.frames)
+    if not is_posed(given):  # the workspace numbers photos in the order in which they were taken in
+        order = [s.path.name for s in find_sources(given)]
+        frames.sort(key=lambda f: order.index(Path(f.name).name))
+    if len(capture.frames) != len(frames):
+        return None
+    known = between(capture.frames, frames)
+    away, _ = pose_errors(capture.frames, frames, known)
+    return known if float(away.median()) < 0.02 * world_of(true).size else None
 
 
 def _against_truth(motion: torch.Tensor, data: Path) -> Row:

@@ -381,10 +381,17 @@ def test_photos_alone_all_the_way(reconstructed, tmp_path, monkeypatch, capsys):
     few = sorted(Path("eval/images").iterdir())
     for path in few[2:]:
         path.unlink()
+    shutil.copy("after/black.png", "eval/images")
+    twice = torch.zeros(300, 400, dtype=torch.bool)  # of a photo that was scaled down since
+    twice[100:200, 100:200] = True
+    for path in few[:2]:
+        write_image(Path("eval/masks_in") / path.with_suffix(".png").name, twice)
     assert main(["evaluate", "work", "eval", "--out", "scores.json", "--localize.features", "500"]) == 0
-    views = json.loads(Path("scores.json").read_text())["views"]
+    scores = json.loads(Path("scores.json").read_text())
+    views = scores["views"]
     assert [v["name"] for v in views] == [path.name for path in few[:2]]
-    assert all(v["scores"]["psnr"] > 10 for v in views)
+    assert scores["left_out"] == [{"name": "black.png", "why": "is black"}]
+    assert all(v["scores"]["psnr"] > 10 and v["scores"]["psnr_in"] is not None for v in views)
 
 
 def believe_photos(capture, field, frames, config, on_stage=None, models=None, known=()):

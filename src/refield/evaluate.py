@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from refield.field.radiance import Field
 from refield.field.render import render_frame
@@ -118,9 +119,9 @@ def evaluate(
 ) -> Report:
     """Render every frame of ``folder/transforms.json``, or of ``frames``, and compare it with its image.
 
-    ``folder`` also holds ``masks_in/`` and ``masks_out/``, PNGs with the images' stems. Either folder may be
-    missing, and its scores are then None. ``old`` is scored on the same pixels; ``on_view`` hears each view's
-    name; ``perceptual`` measures LPIPS.
+    ``folder`` also holds ``masks_in/`` and ``masks_out/``, PNGs with the images' stems; larger ones are scaled down.
+    Either folder may be missing, and its scores are then None. ``old`` is scored on the same pixels; ``on_view`` hears
+    each view's name; ``perceptual`` measures LPIPS.
 
     Raises:
         InputError: the folder cannot be read, or a mask is missing or of another size than its image.
@@ -221,10 +222,18 @@ def _mask(folder: Path, frame: Frame) -> Tensor | None:
         raise InputError(path, f"there is no mask for {frame.name}", "add it, all black if nothing changed there")
     mask = read_mask(path)
     expected = (frame.camera.height, frame.camera.width)
+    if _is_larger(mask, expected):  # the photo was scaled down when it was taken in
+        mask = functional.interpolate(mask[None, None].float(), expected, mode="nearest")[0, 0] > 0.5
     if tuple(mask.shape) != expected:
         what = f"the mask has {mask.shape[1]}x{mask.shape[0]} pixels, its image {expected[1]}x{expected[0]}"
         raise InputError(path, what, "give both the same size")
     return mask
+
+
+def _is_larger(mask: Tensor, expected: tuple[int, int]) -> bool:
+    """Whether a mask is a larger one of the same shape, to within half a pixel."""
+    by = mask.shape[0] / expected[0]
+    return by > 1.1 and abs(mask.shape[1] / by - expected[1]) <= 0.5
 
 
 def _regions(mask_in: Tensor | None, mask_out: Tensor | None, margin: int, like: Tensor) -> dict[str, Tensor]:

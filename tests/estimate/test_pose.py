@@ -2,14 +2,21 @@
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from refield.estimate import recipe
 from refield.estimate.alone import object_alone
+from refield.estimate.associate import AssociateConfig, take_off, trimmed
+from refield.estimate.conclude import _shown_in
+from refield.estimate.detail import detail_of
+from refield.estimate.explain import explained_before
 from refield.estimate.faces import changed_parts
+from refield.estimate.hull import HullConfig
 from refield.estimate.layers import Sight, layers_at
 from refield.estimate.matched import camera_from_object, matched_poses
 from refield.estimate.models import Models
@@ -19,6 +26,7 @@ from refield.estimate.register import Target, register, super_fibonacci, turns_a
 from refield.field.render import render_camera
 from refield.scene.camera import Camera
 from refield.scene.capture import camera_rays
+from refield.scene.planes import Plane
 from refield.scene.pose import angle_between, invert, transform
 from refield.vision.matcher import SiftMatcher
 from tests.estimate.boxes import BoxWorld, camera_at, capture_of, new_photos, standing, turn
@@ -33,6 +41,8 @@ class Stage:
     scene: object
     old: object
     past: list
+    capture: object
+    frames: list
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +59,7 @@ def stage(tmp_path_factory):
         scene, carved, changed_parts(scene.changed, carved, free, 40, scene.models.segmenter)[0]
     )
     past = look_past(BEFORE, scene.changed, scene.survey, [old], config.detect)
-    return Stage(scene, old, past)
+    return Stage(scene, old, past, capture, frames)
 
 
 def error(new_from_old):
@@ -151,6 +161,71 @@ def test_a_moved_object_is_rendered_as_the_moved_world_shows_it(stage):
 
 
 def test_an_object_behind_everything_is_not_shown_and_breaks_nothing(stage):
-    hidden = [replace(p, depth=np.full_like(p.depth, 0.01)) for p in stage.past]
+    hidden = [replace(p, beyond=np.full_like(p.depth, 0.01)) for p in stage.past]
     found = refine(Sight(BEFORE, stage.old, hidden, [stage.old]), TRUE)
     assert found is None or found.explained == 0
+
+
+def test_the_outline_of_a_moved_object_is_whole_in_photos_larger_than_the_working_size(stage):
+    config = recipe.EstimateConfig(survey=6, max_pixels=1200)
+    small = recipe._detected(stage.capture, BEFORE, stage.frames, config, Models())
+    past = look_past(BEFORE, small.changed, small.survey, [stage.old], config.detect)
+    found = refine(Sight(BEFORE, stage.old, past, [stage.old]), TRUE)
+    sight = Sight(BEFORE, stage.old, take_off(BEFORE, past, stage.old, found), [stage.old])
+    masks = _shown_in(sight, found.new_from_old)
+    assert len(masks) == 4
+    for k, mask in masks.items():
+        assert mask.shape == (80, 80) and mask.sum() > 100
+        assert (ndimage.binary_fill_holes(mask.numpy()) == mask.numpy()).all(), k
+
+
+def test_what_would_reach_into_the_ground_is_cut_off(stage):
+    z = stage.old.lattice.centres[..., 2]
+    near = np.abs(stage.old.lattice.centres - stage.old.centre)[..., :2].max(-1) < 0.1
+    deeper = replace(stage.old, voxels=stage.old.voxels | (near & (z < 0)), free=np.ones_like(stage.old.free))
+    assert (deeper.voxels & (z < 0)).sum() > 0.03 * deeper.voxels.sum()
+    ground = SimpleNamespace(
+        planes=[Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)],
+        carving=HullConfig(),
+        believe=AssociateConfig(),
+        shape=recipe.ObjectConfig(),
+        fine=RefineConfig(),
+    )
+    sight = Sight(BEFORE, deeper, stage.past, [stage.old])
+    old, change = trimmed(ground, sight, refine(sight, TRUE))
+    assert not (old.voxels & (z < 0)).any()
+    assert (old.voxels & stage.old.voxels).sum() > 0.9 * stage.old.voxels.sum()
+    assert error(change.new_from_old)[0] < 0.6
+    same, _ = trimmed(replace_planes(ground), sight, refine(sight, TRUE))
+    assert (same.voxels & (z < 0)).any()  # without the ground nothing denies it
+
+
+def replace_planes(ground):
+    return SimpleNamespace(**{**vars(ground), "planes": []})
+
+
+def test_what_a_field_shows_badly_is_told_from_what_it_shows_well():
+    rng = np.random.default_rng(0)
+    photo = rng.uniform(0.2, 0.8, (20, 20, 3)).astype(np.float32)
+    here = np.zeros((20, 20), bool)
+    here[4:16, 4:16] = True
+    assert explained_before([(photo, photo, here)], 5.0) == 1.0
+    flat = np.full_like(photo, 0.5)
+    assert explained_before([(photo, flat, here)], 2.0) < 0.5
+    few = np.zeros_like(here)
+    few[:2, :3] = True
+    assert explained_before([(photo, flat, few)], 2.0) == 1.0  # too few to say
+
+
+def test_detail_of_old_photos_is_what_the_field_lacks(stage):
+    """The field paints the crate without a pattern: what it lacks is the pattern."""
+    plain = BoxWorld((replace(CRATE, paint=-1),))
+    views = [p.view for p in stage.past]
+    detail = detail_of(plain, stage.old, stage.capture.frames, views, TRUE, 3, 80_000)
+    assert 4 <= len(detail.patches) <= 12
+    top = torch.from_numpy(stage.old.cloud.points[stage.old.cloud.normals[:, 2] > 0.9])
+    eye = torch.from_numpy(stage.old.centre) + torch.tensor([0.6, 0.2, 1.5])
+    lacks, true = detail.at(top, eye), CRATE.colour(top)
+    lacks, true = lacks - lacks.mean(0), true - true.mean(0)
+    assert float((lacks * true).sum() / (lacks.norm() * true.norm())) > 0.8
+    assert detail_of(plain, stage.old, [], views, TRUE, 3, 80_000).patches == ()

@@ -17,7 +17,7 @@ from refield.estimate.localize import LocalizeConfig
 from refield.evaluate import EvaluateConfig, Report, Scores, evaluate
 from refield.history import state
 from refield.photos.taken import PhotoConfig
-from refield.scene.capture import Frame
+from refield.scene.change import PlacedPhoto
 from refield.scene.errors import InputError
 from refield.scene.files import write_json
 from refield.scene.load import is_posed
@@ -34,7 +34,7 @@ class Evaluate:
     """the workspace"""
     eval: Annotated[Path, arg(metavar="EVAL"), Positional]
     """a folder with images/, masks_in/ and masks_out/ (PNGs with the images' names), and transforms.json: without
-    it the photos are placed as new ones are"""
+    it the photos are placed by what they show, no more exactly than that"""
     visit: int | None = None
     """the state to measure: 0 is before any visit; the latest by default, beside the state before any"""
     out: Path | None = None
@@ -57,23 +57,25 @@ def run(options: Evaluate) -> None:
     now = state(workspace, visit)
     before = state(workspace, 0) if visit else None
     with contextlib.ExitStack() as held:
-        views = None if is_posed(options.eval) else _views(options, workspace, clock, held)
+        placed = [] if is_posed(options.eval) else _placed(options, workspace, clock, held)
+        views = [p.frame for p in placed if p.frame is not None] or None
         clock.stage("evaluate")
         report = evaluate(now, options.eval, old=before, frames=views, config=options.config, perceptual=perceptual)
     clock.stop()
     if options.out is not None:
         with writable(options.out):
-            write_json(options.out, report.to_dict())
+            left_out = [{"name": p.name, "why": p.why} for p in placed if p.frame is None]
+            write_json(options.out, report.to_dict() | {"left_out": left_out})
     results().print(table(report, f"visit {visit}"))
 
 
-def _views(options: Evaluate, workspace: Workspace, clock: Clock, held: contextlib.ExitStack) -> list[Frame]:
+def _placed(options: Evaluate, workspace: Workspace, clock: Clock, held: contextlib.ExitStack) -> list[PlacedPhoto]:
     """Photos without poses, in the workspace's world; their upright copies lie in its cache."""
     held.enter_context(workspace.writing())
     inner = options.eval / "images"
     photos = inner if inner.is_dir() else options.eval  # masks are no photos
     how = Placing(options.intake, options.localize)
-    return [p.frame for p in placed_photos(photos, workspace, clock, how) if p.frame is not None]
+    return placed_photos(photos, workspace, clock, how)
 
 
 def _opened(folder: Path | None) -> Perceptual | None:

@@ -26,7 +26,7 @@ from refield.estimate.light import even_and_grey, log_ratio
 from refield.estimate.look import Array, View
 from refield.estimate.matched import matched_poses
 from refield.estimate.objects import Old
-from refield.estimate.outline import ObjectConfig, restricted
+from refield.estimate.outline import FEWEST_POINTS, ObjectConfig, restricted
 from refield.estimate.past import Past, changed_share, gone_score, look_past, silhouette
 from refield.estimate.pose_change import COARSEST, FINER, PoseChange, RefineConfig, refine
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
@@ -52,19 +52,22 @@ class AssociateConfig:
     explains: float = 0.5
     """part of the object's pixels that the moved object must explain"""
     shown: float = 0.8
-    """part of the object's pixels that the field shows right in old photos; if it is less, less need be explained"""
+    """part of the object's pixels that the field shows right in old photos; if it is less, down to half as much need be
+    explained"""
     gains: float = 0.15
     """by how much more than the old rendering did"""
+    alike: float = 0.5
+    """part of the pixels at its new place that look as before; if it is more, it must gain twice as much"""
     refined: int = 2
     """candidates of an object that are refined"""
     gone: float = 0.45
     """part of an object's pixels that must show what was behind it, for it to have left"""
     arrived: float = 0.5
-    """part of a newcomer's pixels that nothing else explains; of a moved object's, that do not show what was there"""
+    """part of a newcomer's pixels that nothing else explains"""
     newcomer: float = 0.01
     """part of a photo that something new must fill in at least one of them (the paper's contour area, §10.2.2)"""
     trim: float = 0.03
-    """part of an object's voxels that the new photos deny, from which on it is trimmed"""
+    """part of an object's voxels that the new photos or the ground deny, from which on it is trimmed"""
     core: float = 0.25
     """part of an object's voxels that must remain when it is trimmed"""
     still: float = 1.2
@@ -118,7 +121,7 @@ class Fit:
     score: float
     """of the registration, as `Candidate.score`"""
     old: Old
-    """without what the photos show not to be at its new place"""
+    """without what cannot be at its new place"""
     change: PoseChange
 
 
@@ -357,8 +360,9 @@ def best_fit(
     if best is None:
         return None
     old, best = trimmed(ground, sight, best)
-    least = believe.explains * min(1.0, shown_right(ground, old, past) / believe.shown)
-    if best.explained < max(least, best.before + believe.gains) or best.before > 1 - believe.arrived:
+    least = believe.explains * min(1.0, max(0.5, shown_right(ground, old, past) / believe.shown))
+    gains = believe.gains * (2 if best.before > believe.alike else 1)
+    if best.explained < max(least, best.before + gains):
         return None
     return Fit(found[0].score, old, best)
 
@@ -403,6 +407,8 @@ def trimmed(ground: Ground, sight: Sight, change: PoseChange) -> tuple[Old, Pose
     if not parts or parts[0].sum() < ground.believe.core * len(places):
         return old, change
     smaller = restricted(old, parts[0], ground.shape)
+    if len(smaller.cloud.points) < FEWEST_POINTS:
+        return old, change
     again = refine(replace(sight, old=smaller), change.new_from_old, ground.fine)
     return (old, change) if again is None or again.explained <= change.explained - 0.02 else (smaller, again)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from refield.estimate.look import Array, View, load_photo
-from refield.estimate.objects import Old, Patch, corners_of, look_around
+from refield.estimate.objects import Old, Patch, box_in, corners_of, look_around
 from refield.field.radiance import Field
 from refield.scene.capture import Frame
 from refield.scene.pose import invert, transform
@@ -74,14 +74,17 @@ def detail_of(
         rays: looked along in all; more are avoided by scaling the photos down.
     """
     middle = torch.from_numpy(old.centre).double()
+    corners = corners_of(*old.grid.tight_aabb().numpy())
+    frames = [f for f in frames if box_in(f.camera, f, corners) is not None]
+    if not frames:
+        return Detail((), ())
     ways = functional.normalize(torch.stack([f.centre for f in frames]).double() - middle, dim=-1)
     chosen: set[int] = set()
     for view in views:
         eye = transform(invert(new_from_old), view.frame.centre.double())
         alike = ways @ functional.normalize(eye - middle, dim=-1)
         chosen.update(alike.topk(min(each, len(frames))).indices.tolist())
-    low, high = old.grid.tight_aabb().numpy()
-    patches = look_around(field, [frames[k] for k in sorted(chosen)], corners_of(low, high), rays)
+    patches = look_around(field, [frames[k] for k in sorted(chosen)], corners, rays)
     return Detail(tuple(patches), tuple(_missing(p) for p in patches))
 
 

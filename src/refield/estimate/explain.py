@@ -13,6 +13,7 @@ from refield.estimate.look import Array
 from refield.vision import pixels
 
 _LIMIT = 1.5  # times the difference from which on a pixel counts as changed
+_FEWEST = 50  # pixels from which a share is told
 _LIGHT = 2.5  # times brighter or darker a side may be where the object is now
 
 
@@ -58,7 +59,7 @@ def explained(photos: Sequence[Compared], sigma: float) -> Explained:
 
 
 def explained_before(pictures: Sequence[tuple[Array, Array, NDArray[np.bool_]]], threshold: float) -> float:
-    """How much of an object's pixels in old photos show what the old field does there; 1 if none show the object.
+    """How much of an object's pixels in old photos show what the old field does there; 1 if too few show the object.
 
     No pose explains more: of a thing a few pixels wide the field shows hardly more than a blur.
 
@@ -71,7 +72,7 @@ def explained_before(pictures: Sequence[tuple[Array, Array, NDArray[np.bool_]]],
         if here.any():
             right += int((here & (pixels.colour_difference(photo, rendering, 1) < _LIMIT * threshold)).sum())
             count += int(here.sum())
-    return right / count if count else 1.0
+    return right / count if count >= _FEWEST else 1.0
 
 
 def _relit(p: Compared, sigma: float) -> Array:

@@ -63,7 +63,7 @@ class Crop:
     threshold: Tensor
     """(n,) Lab units"""
     beyond: Tensor
-    """(n,) how far away what stands there without the object is, no finer than the working size"""
+    """(n,) depth of the old field without the objects that left, no finer than the working size"""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -125,7 +125,7 @@ class Layers:
         if all(p.view.camera == c.camera for p, c in zip(past, self.crops)):
             cut = [(slice(c.box[1], c.box[3]), slice(c.box[0], c.box[2])) for c in self.crops]
             rgb = np.concatenate([p.rgb[at].reshape(-1, 3) for p, at in zip(past, cut)])
-            depth = np.concatenate([p.depth[at].reshape(-1) for p, at in zip(past, cut)])
+            depth = np.concatenate([p.beyond[at].reshape(-1) for p, at in zip(past, cut)])
             return torch.from_numpy(rgb), torch.from_numpy(depth)
         seen = see(self.sight.field, self._rays, Hidden(tuple(o.haze for o in self.sight.olds)))
         return seen.rgb, seen.depth
@@ -245,5 +245,5 @@ def _crop(index: int, p: Past, camera: Camera, box: tuple[int, int, int, int]) -
         torch.from_numpy(photo.reshape(-1, 3)),
         torch.from_numpy(p.known[pick].reshape(-1)),
         torch.from_numpy(p.changed.threshold[pick].reshape(-1)),
-        torch.from_numpy(p.depth[pick].reshape(-1)),
+        torch.from_numpy(p.beyond[pick].reshape(-1)),
     )

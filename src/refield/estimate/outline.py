@@ -24,6 +24,8 @@ from refield.scene.planes import Plane
 from refield.vision import pixels
 from refield.vision.segmenter import Segmenter, cut_out
 
+FEWEST_POINTS = 30
+"""of an object's surface; of fewer it cannot be found again"""
 _FOUND = 0.25  # of an object's voxels that a segmenter must leave to be believed
 
 
@@ -96,7 +98,7 @@ def outline(
         return None
     voxels = ndimage.binary_fill_holes(voxels)
     cloud = surface_cloud(lattice, voxels, patches, config.points)
-    return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= 30 else None
+    return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= FEWEST_POINTS else None
 
 
 def remembered(
@@ -116,7 +118,9 @@ def remembered(
         return None
     cloud = surface_cloud(lattice, voxels, patches, config.points)
     free = _free(lattice, planes)
-    return Old(lattice, voxels, free, cloud, tuple(patches), remembered=True) if len(cloud.points) >= 30 else None
+    if len(cloud.points) < FEWEST_POINTS:
+        return None
+    return Old(lattice, voxels, free, cloud, tuple(patches), remembered=True)
 
 
 def _free(lattice: Lattice, planes: Sequence[Plane]) -> Voxels:

@@ -40,6 +40,8 @@ class Past:
     """(H, W) Lab difference of the photo and ``rgb``"""
     covered: Mask
     """pixels at which an object that was placed stands in front"""
+    beyond: Array
+    """as ``depth``, without the objects that were placed since"""
 
     @property
     def view(self) -> View:
@@ -83,7 +85,7 @@ def _look_past(field: Field, c: Changed, survey: Sequence[View], olds: Sequence[
     known = ~pixels.dilate(pixels.close(guess, 3), 1)
     sigma = blur_sigma(view, config)
     diff = pixels.colour_difference(pixels.blur(view.photo, sigma), pixels.blur(rgb, sigma), config.reach)
-    return Past(c, rgb, depth, gone, known, diff, np.zeros(view.shape, bool))
+    return Past(c, rgb, depth, gone, known, diff, np.zeros(view.shape, bool), depth)
 
 
 def _seen_before(view: View, depth: Array, survey: Sequence[View]) -> Mask:

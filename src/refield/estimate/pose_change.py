@@ -44,7 +44,7 @@ class RefineConfig:
     robust: float = 0.1
     """colour error, in [0, 1] RGB, beyond which a pixel counts less"""
     detail: int = 3
-    """old photos that each new one takes texture from that the field has not learnt, in the finest refinement"""
+    """old photos that each new one takes texture from that the field has not learnt, from the finest refinement on"""
     detail_rays: int = 80_000
     """over those old photos; they are scaled down to keep to it"""
     unseen: float = 0.02

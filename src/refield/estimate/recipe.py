@@ -29,7 +29,7 @@ from refield.field.radiance import Field
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import OccupancyGrid, PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
-from refield.scene.planes import Plane, support_planes
+from refield.scene.planes import Plane, rough_planes
 
 OnStage = Callable[[str], None]
 _OTHER_LIGHT = 2.0  # times brighter or darker, from which on a photo's light is spoken of
@@ -201,13 +201,7 @@ def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
     depths = [(c.view, c.view.depth[c.mask & np.isfinite(c.view.depth)]) for c in changed]
     sizes = [float(np.median(d)) * v.pixel_angle for v, d in depths if len(d)]
     cameras = np.stack([v.centre for v in survey])
-    if len(points) < 50:
-        return []
-    for rough in (1, 2, 4):  # times what pixels resolve: a fitted surface may be uneven
-        planes = support_planes(points, cameras, rough * 0.7 * float(np.median(sizes)))
-        if planes:
-            return planes
-    return []
+    return rough_planes(points, cameras, float(np.median(sizes)))
 
 
 def _carved(scene: _Scene, region: Lattice) -> tuple[Hull, Voxels]:

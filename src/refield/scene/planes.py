@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+_FEWEST = 50  # points
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,17 @@ class Plane:
 
     def height(self, points: Array) -> Array:
         return points @ self.normal - np.float32(self.offset)
+
+
+def rough_planes(points: Array, cameras: Array, resolved: float) -> list[Plane]:
+    """`support_planes` of points that are exact to ``resolved`` (world units), or up to four times less exact."""
+    if len(points) < _FEWEST:
+        return []
+    for rough in (1, 2, 4):  # a fitted surface may be uneven
+        planes = support_planes(points, cameras, rough * 0.7 * resolved)
+        if planes:
+            return planes
+    return []
 
 
 def support_planes(points: Array, cameras: Array, tol: float, seed: int = 0) -> list[Plane]:

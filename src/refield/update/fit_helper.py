@@ -20,6 +20,7 @@ from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.frozen import Segments, Woven, weave
 from refield.update.helper import HelperOccupancy, emptiness
+from refield.update.region import Region
 from refield.update.supervision import Lessons
 
 _CHUNK = 16384  # rays
@@ -59,7 +60,8 @@ class HelperTraining:
     ) -> None:
         self.helper, self.config, self.frozen = helper, config, frozen
         self.sparse, self.old, self.judge = sparse, old, judge
-        self.empty = emptiness(frozen.change, helper.sampler, frozen.bare, planes)
+        added = tuple(o.grid for o in frozen.change.objects if o.kind == "added")
+        self.empty = emptiness(frozen.change, helper.sampler, Region(added + frozen.bare.grids), planes)
         self.occupancy = HelperOccupancy(helper)
         self.adam = TableAdam(helper)
         self.rays_per_step, self.steps_done = 1024, 0

@@ -8,25 +8,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from refield.scene.planes import Plane, support_planes
+from refield.scene.planes import Plane, rough_planes
 
 _POINTS = 6000  # that planes are looked for among
-_FEWEST = 50
 
 
-def planes_around(points: Tensor, box: Tensor, eyes: Tensor, pixel: float) -> list[Plane]:
+def planes_around(points: Tensor, box: Tensor, eyes: Tensor, resolved: float) -> list[Plane]:
     """Planes among surface points (N, 3) in and around a world box (2, 3).
 
     Args:
         eyes: (C, 3) camera centres, from which the planes are seen.
-        pixel: side of a pixel there, world units: how exact the points are.
+        resolved: how exact the points are, world units.
     """
     near = points[((points - box.mean(0)).abs() < (box[1] - box[0]).max()).all(-1)]
     some = near[torch.randperm(len(near))[:_POINTS]].double().numpy()
-    if len(some) < _FEWEST:
-        return []
-    for rough in (1, 2, 4):  # times what pixels resolve: a fitted surface may be uneven
-        planes = support_planes(some, eyes.double().numpy(), rough * 0.7 * pixel)
-        if planes:
-            return planes
-    return []
+    return rough_planes(some, eyes.double().numpy(), resolved)

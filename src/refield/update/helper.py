@@ -20,6 +20,7 @@ from refield.update.region import Region
 
 _OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
 _WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
+_RIM = 0.5  # as empty as this is the rim of what stood on a plane, above the plane
 _BAND = 2.5  # cells above what an object stood on that may hold its surface
 _DEPTH = 0.12  # of an object's mean side: so far inside, nothing that stood there can have been
 
@@ -52,8 +53,8 @@ def emptiness(change: SceneChange, cells: OccupancySampler, taken: Region, plane
     """How deep inside an object that left each cell lies, (R**3,) float32: 0 outside and at its surface, 1 deep inside.
 
     What stood in the way of everything is not there any more; only near its surface may something else begin: the
-    ground under it, the wall behind it. Where that is one of ``planes``, all above it is empty. 0 in ``taken``, where
-    something stands now.
+    ground under it, the wall behind it. Where that is one of ``planes``, what is above it near the surface is half as
+    empty: a wall that it leant on may not be among them. 0 in ``taken``, where something stands now.
     """
     r = cells.resolution
     depth = torch.zeros(r**3)
@@ -62,6 +63,8 @@ def emptiness(change: SceneChange, cells: OccupancySampler, taken: Region, plane
         if o.kind == "added":
             continue
         inside = o.grid.contains(centres).reshape(r, r, r)
+        if not inside.any():
+            continue
         box = o.grid.tight_aabb()
         reach = float((box[1] - box[0]).mean()) * _DEPTH
         cell = 4 * cells.contraction.radius / r
@@ -70,7 +73,8 @@ def emptiness(change: SceneChange, cells: OccupancySampler, taken: Region, plane
         touched = [p for p in planes if abs(float(np.quantile(p.height(o.grid.occupied().numpy()), 0.02))) < reach]
         if touched:
             above = [p.height(centres.numpy()) > max(_BAND * cell, 2 * p.noise) for p in touched]
-            depth[inside.reshape(-1) & torch.from_numpy(np.logical_and.reduce(above))] = 1.0
+            free = inside.reshape(-1) & torch.from_numpy(np.logical_and.reduce(above))
+            depth[free] = depth[free].clamp_min(_RIM)
     return torch.where(taken.contains(centres), 0.0, depth) if taken.grids else depth
 
 

@@ -93,7 +93,9 @@ def update_field(
     if cut.to_learn.objects:
         old, depth = _old_lessons(capture, cut, region, config, light)
         around = old.rays.origins + old.rays.directions * depth[:, None]
-        planes = planes_around(around, wide.box, eyes, _pixel(change, wide.box.mean(0)))
+        middle = wide.box.mean(0)
+        exact = max(_pixel(change, middle), step_near(field, middle))
+        planes = planes_around(around, wide.box, eyes, exact)
     sparse = known.sparse[meets(region, known.sparse.rays).nonzero()[:, 0]]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
