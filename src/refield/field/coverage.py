@@ -22,7 +22,10 @@ def knowable(sampler: OccupancySampler, frames: tuple[Frame, ...]) -> Tensor:
     """
     r = sampler.resolution // _COARSE
     coarse = OccupancySampler(sampler.contraction, torch.zeros(r, r, r, dtype=torch.uint8), sampler.step)
-    x = coarse.points_in(torch.arange(r**3), jitter=False)
+    cells = torch.arange(r**3)
+    x = coarse.points_in(cells, jitter=False)
+    # the contraction makes cells outside of the core as much larger as their distance squared
+    width = 4 * sampler.contraction.radius / r * coarse.distance(cells).clamp_min(1.0) ** 2
     unit = _NEAR * sampler.contraction.radius
     seen, near = torch.zeros(len(x), dtype=torch.int32), torch.zeros(len(x), dtype=torch.int32)
     for f in frames:
@@ -32,9 +35,11 @@ def knowable(sampler: OccupancySampler, frames: tuple[Frame, ...]) -> Tensor:
         c = f.camera
         # the lens' distortion moves the frustum's sides by a little; the edge of a photo decides nothing
         u, v = local[:, 0] / z * c.fx + c.cx, local[:, 1] / z * c.fy + c.cy
-        inside = (local[:, 2] > 0) & (u > 0) & (v > 0) & (u < c.width) & (v < c.height)
-        seen += inside
-        near += inside & (local.square().sum(-1) < unit**2)
+        seen += (local[:, 2] > 0) & (u > 0) & (v > 0) & (u < c.width) & (v < c.height)
+        # a photo that shows any part of a cell can fill it, with its middle outside of the picture
+        mu, mv = width / z * c.fx, width / z * c.fy
+        part = (u > -mu) & (v > -mv) & (u < c.width + mu) & (v < c.height + mv) & (local[:, 2] > -width)
+        near += part & (local.square().sum(-1) < unit**2)
     enough = min(max(_LEAST, round(_PART * len(frames))), _ENOUGH, len(frames))
     allowed = ((near == 0) | (seen >= enough)).reshape(1, 1, r, r, r).float()
     return functional.interpolate(allowed, scale_factor=_COARSE, mode="nearest").reshape(-1) > 0
