@@ -38,7 +38,7 @@ def test_only_what_several_cameras_see_may_be_before_one() -> None:
 def test_a_cell_that_only_the_edge_of_a_photo_shows_is_before_its_camera() -> None:
     ring = tuple(camera_on_a_ring(0.6 * k) for k in range(5))
     assert not allowed(ring, 1.35, 0.16, 0.0)  # its middle is outside of the picture, a part of it is not
-    assert allowed(ring, 1.35, 0.9, 0.0)
+    assert allowed(ring, 1.35, 0.0, 0.45)
 
 
 def test_one_camera_alone_may_see_anything() -> None:
