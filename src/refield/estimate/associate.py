@@ -28,7 +28,7 @@ from refield.estimate.matched import matched_poses
 from refield.estimate.objects import Old
 from refield.estimate.outline import FEWEST_POINTS, ObjectConfig, restricted
 from refield.estimate.past import Past, changed_share, gone_score, look_past, silhouette
-from refield.estimate.pose_change import COARSEST, FINER, PoseChange, RefineConfig, refine
+from refield.estimate.pose_change import COARSEST, FINER, PoseChange, RefineConfig, refine, shared_out
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
 from refield.field.radiance import Field
 from refield.scene.capture import Frame
@@ -371,7 +371,8 @@ def _detail(ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor
     fine, views = ground.fine, [p.view for p in past]
     if fine.detail == 0 or not ground.photographed:
         return None
-    return detail_of(ground.field, old, ground.photographed, views, new_from_old, fine.detail, fine.detail_rays)
+    rays = shared_out(fine.detail_rays, len(views))
+    return detail_of(ground.field, old, ground.photographed, views, new_from_old, fine.detail, rays)
 
 
 def shown_right(ground: Ground, old: Old, past: Sequence[Past]) -> float:

@@ -17,6 +17,8 @@ from refield.estimate.explain import explained
 from refield.estimate.layers import Crop, Layer, Layers, Sight, layers_at
 from refield.vision import pixels
 
+FEW = 4
+"""new photos, from which on more rays are taken"""
 ALL, COARSEST, FINER = slice(None), slice(0, 1), slice(1, None)
 """levels of the refinement"""
 
@@ -30,7 +32,8 @@ class RefineConfig:
     """How a pose change is refined through the field."""
 
     rays: tuple[int, ...] = (8_000, 60_000)
-    """over all new photos, coarse to fine; they are scaled down to keep to it"""
+    """over all new photos, coarse to fine; they are scaled down to keep to it. From `FEW` photos on, as many times more
+    as there are more of them"""
     blurs: tuple[float, ...] = (1.2, 0.5)
     """pixels, coarse to fine"""
     steps: tuple[int, ...] = (8, 4)
@@ -46,7 +49,7 @@ class RefineConfig:
     detail: int = 3
     """old photos that each new one takes texture from that the field has not learnt, from the finest refinement on"""
     detail_rays: int = 80_000
-    """over those old photos; they are scaled down to keep to it"""
+    """over those old photos; they are scaled down to keep to it. More for more new photos, as above"""
     unseen: float = 0.02
     """a turn is unobservable if the photos hold it this much less than a shift of the same size"""
 
@@ -151,6 +154,11 @@ def _residuals(
     return e, weight, torch.stack(columns, -1)
 
 
+def shared_out(rays: int, photos: int) -> int:
+    """Rays in all for so many new photos: what each shows is not made coarser by having more of them."""
+    return round(rays * max(1.0, photos / FEW))
+
+
 def refine(
     sight: Sight, start: Tensor, config: RefineConfig = RefineConfig(), levels: slice = ALL
 ) -> PoseChange | None:
@@ -158,7 +166,7 @@ def refine(
     unit = torch.tensor([1.0] * 3 + [1 / max(sight.old.radius, 1e-6)] * 3, dtype=torch.float64)
     pose = start
     for rays, sigma, steps in list(zip(config.rays, config.blurs, config.steps))[levels]:
-        ready = layers_at(sight, pose, rays)
+        ready = layers_at(sight, pose, shared_out(rays, len(sight.past)))
         if not ready.crops:
             return None
         pose, hessian = _descend(ready, pose, (sigma, steps), unit, config)
