@@ -98,7 +98,7 @@ def test_the_new_state_is_learnt(tuned: bool, capture: Capture, change: SceneCha
     now = torch.from_numpy(places_of(change).now[0].silhouette(frame))
     was = torch.from_numpy(places_of(change).was[0].silhouette(frame))
     for mask in (now, was):  # four photos of 40 x 40 pixels do not show much of what arrived
-        assert error(field, AFTER, mask, frame) < 0.75 * error(old, AFTER, mask, frame)
+        assert error(field, AFTER, mask, frame) < 0.85 * error(old, AFTER, mask, frame)
     for name, value in old.state_dict().items():
         assert torch.equal(value, kept[name]), "the old field was changed"
     assert not field.training and field.sampler.grid.sum() < old.sampler.grid.numel() / 2
