@@ -59,16 +59,12 @@ def main() -> int:
     print(_conditions())
     if options.data is not None and options.whole:
         _whole(options.data / "fox_moved", options.work)
-    elif options.world and options.whole:
-        for world in options.world:
-            _whole(world, options.work / f"world-{world.name}")
-        return 0
     elif options.data is not None:
         found = _motion("fox", options.data / "fox" / "images", options.data / "fox", options.work / "fox")
         _localization(options.data / "fox" / "images", found, options.work)
         _rejected(options.data / "fox" / "images", found, options.work)
     for world in options.world:
-        _world(world, options.work / f"world-{world.name}")
+        (_whole if options.whole else _world)(world, options.work / f"world-{world.name}")
     return 0
 
 

@@ -93,12 +93,13 @@ def test_nothing_changed_masks_nothing(capture: Capture) -> None:
 @pytest.mark.parametrize("tuned", [False, True])
 def test_the_new_state_is_learnt(tuned: bool, capture: Capture, change: SceneChange, old: HashField) -> None:
     kept = {k: v.clone() for k, v in old.state_dict().items()}
-    field = finetune(capture, old, change, TINY) if tuned else retrain(capture, change, TINY)
+    longer = replace(TINY, steps=400)  # at 200 a last grey level in the photos decides whether it is learnt
+    field = finetune(capture, old, change, longer) if tuned else retrain(capture, change, longer)
     frame = change.frames[0]
     now = torch.from_numpy(places_of(change).now[0].silhouette(frame))
     was = torch.from_numpy(places_of(change).was[0].silhouette(frame))
     for mask in (now, was):  # four photos of 40 x 40 pixels do not show much of what arrived
-        assert error(field, AFTER, mask, frame) < 0.85 * error(old, AFTER, mask, frame)
+        assert error(field, AFTER, mask, frame) < 0.75 * error(old, AFTER, mask, frame)
     for name, value in old.state_dict().items():
         assert torch.equal(value, kept[name]), "the old field was changed"
     assert not field.training and field.sampler.grid.sum() < old.sampler.grid.numel() / 2

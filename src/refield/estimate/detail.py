@@ -42,12 +42,10 @@ class Detail:
         if len(x) == 0:
             return total
         for patch, missing in zip(self.patches, self.missing):
-            where, inside = patch.pixel_of(x)
             before = x - torch.from_numpy(patch.centre)
             distance = before.norm(dim=-1).clamp_min(1e-9)
-            off = (torch.from_numpy(patch.depth).reshape(-1)[where] - distance).abs()
             straight = (look * before).sum(-1) / distance
-            shown = inside & (off < _SAME / patch.camera.fx * distance)
+            shown = patch.behind_surface(x).abs() < _SAME / patch.camera.fx * distance
             counts = shown * straight.clamp_min(0) ** _STRAIGHT
             total += counts[:, None] * _looked_up(missing, patch, x)
             weight += counts
@@ -56,8 +54,7 @@ class Detail:
 
 def _looked_up(missing: Array, patch: Patch, x: Tensor) -> Tensor:
     """The picture's value (N, 3) where world points (N, 3) project to, bilinear."""
-    m = patch.frame.world_from_cam
-    uv, _ = patch.camera.project((x - m[:3, 3].float()) @ m[:3, :3].float())
+    uv, _ = patch.project(x)
     h, w = patch.depth.shape
     unit = (uv - torch.tensor(patch.box[:2])) / torch.tensor([w, h]) * 2 - 1
     image, at = torch.from_numpy(missing).permute(2, 0, 1)[None], unit[None, :, None]

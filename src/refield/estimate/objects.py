@@ -53,10 +53,14 @@ class Patch:
         with np.errstate(invalid="ignore"):
             return (self.centre + d * self.depth[..., None]).astype(np.float32)
 
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """World points (N, 3) -> pixels (N, 2) of ``camera`` and depths along its axis (N,)."""
+        m = self.frame.world_from_cam
+        return self.camera.project((points - m[:3, 3].float()) @ m[:3, :3].float())
+
     def pixel_of(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """World points (N, 3) -> index into the patch's pixels, row by row, (N,), and whether they fall in it."""
-        m = self.frame.world_from_cam
-        uv, z = self.camera.project((points - m[:3, 3].float()) @ m[:3, :3].float())
+        uv, z = self.project(points)
         j, i = uv[:, 0].floor().long() - self.box[0], uv[:, 1].floor().long() - self.box[1]
         h, w = self.depth.shape
         inside = (z > 0) & (i >= 0) & (i < h) & (j >= 0) & (j < w)

@@ -87,15 +87,15 @@ def update_field(
         updated.why_stopped = "earlier visits know all of it"
         return updated
     say("supervise")
-    region = _in_reach(wide.sampler(step_near(field, wide.box.mean(0))), capture.train + change.frames)
+    middle = wide.box.mean(0)
+    step = step_near(field, middle)
+    region = _in_reach(wide.sampler(step), capture.train + change.frames)
     # what earlier visits know has been taken from them already; of the rest no old photo shows anything
     old, planes = known.sparse[:0], list[Plane]()
     if cut.to_learn.objects:
         old, depth = _old_lessons(capture, cut, region, config, light)
         around = old.rays.origins + old.rays.directions * depth[:, None]
-        middle = wide.box.mean(0)
-        exact = max(_pixel(change, middle), step_near(field, middle))
-        planes = planes_around(around, wide.box, eyes, exact)
+        planes = planes_around(around, wide.box, eyes, max(_pixel(change, middle), step))
     sparse = known.sparse[meets(region, known.sparse.rays).nonzero()[:, 0]]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
