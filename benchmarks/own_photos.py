@@ -56,7 +56,7 @@ def main() -> int:
         "--work", type=Path, default=Path("build/own-photos"), help="where intermediate things are kept"
     )
     options = parser.parse_args()
-    print(_conditions())
+    print(conditions())
     if options.data is not None and options.whole:
         _whole(options.data / "fox_moved", options.work)
     elif options.data is not None:
@@ -68,7 +68,8 @@ def main() -> int:
     return 0
 
 
-def _conditions() -> str:
+def conditions() -> str:
+    """Date, machine and command, for the head of a table."""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     cpu = next((line.split(":")[1].strip() for line in lines if "model name" in line), platform.processor())
     machine = f"{os.cpu_count()} cores ({cpu}), Python {platform.python_version()}"

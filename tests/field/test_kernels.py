@@ -235,6 +235,55 @@ def test_train_step_is_the_same_bit_for_bit_for_any_number_of_threads() -> None:
         assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize("fill, segments, rays", [(0.3, 3, 300), (1.0, 0, 64), (0.0, 2, 20), (0.2, 5, 257)])
+def test_woven_step(fill: float, segments: int, rays: int) -> None:
+    """A helper's fused step against autograd: segments before, between and behind samples, places that are taken, a
+    toll on some cells; rays draw their segments from a larger set, some twice."""
+    torch.manual_seed(11)
+    resolutions = geometric_levels(8, 64, 4)
+    nets, tables = networks(4, 16, 7), torch.randn(4, 1 << 12, 2)
+    origins = torch.nn.functional.normalize(torch.randn(rays, 3), dim=-1) * 3
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3) * 0.5 - origins, dim=-1)
+    batch = reference.Batch((origins, directions, torch.rand(rays)), torch.rand(rays, 3), torch.rand(rays, 3))
+    counts = torch.randint(segments + 1, (2 * rays,))
+    offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    t_mid = torch.cat([(5 * torch.rand(int(n))).sort().values for n in counts])
+    chosen = torch.randint(2 * rays, (rays,))
+    fixed = reference.Fixed(t_mid, torch.rand(len(t_mid)) * 2, torch.rand(len(t_mid), 3), offsets, chosen)
+    unwanted = reference.Unwanted(0.3 * torch.rand(32**3), lambda x: x[:, 0] > 0.4)
+    grid = (torch.rand(32, 32, 32) < fill).to(torch.uint8)
+    results = []
+    for twin in (reference, cpu):
+        into = [torch.zeros_like(p) for p in (tables, *nets)]
+        space, field = (torch.tensor([0.1, 0.0, 0.2]), 1.5), (tables, resolutions, nets)
+        aim = reference.Aim(distortion=0.3, gradient_unit=2.5, stop=7.0)
+        step = twin.woven_step(batch, fixed, unwanted, space, grid, (0.0, 60.0, 0.05), field, aim, into)
+        results.append((step, into))
+    (truth, true_grads), (fast, grads) = results
+    assert fast.rays == truth.rays and fast.loss == pytest.approx(truth.loss, rel=1e-4)
+    assert abs(len(fast.weights) - len(truth.weights)) <= 0.002 * len(truth.weights)
+    close(fast.weights.sort().values[-50:], truth.weights.sort().values[-50:])
+    for mine, true in zip(grads, true_grads):
+        assert (mine - true).norm() <= 1e-2 * true.norm()
+
+
+def test_a_woven_step_without_anything_woven_in_is_a_training_step() -> None:
+    torch.manual_seed(12)
+    nets, tables = networks(4, 32, 15), torch.randn(4, 1 << 12, 2)
+    rays = (torch.rand(200, 3), torch.nn.functional.normalize(torch.randn(200, 3), dim=-1), torch.rand(200))
+    batch = reference.Batch(rays, torch.rand(200, 3), torch.rand(200, 3))
+    place = ((torch.zeros(3), 1.0), torch.ones(16, 16, 16, dtype=torch.uint8), (0.0, 50.0, 0.05))
+    field, aim = (tables, geometric_levels(8, 64, 4), nets), reference.Aim(0.1, 1.0, 7.0)
+    nothing = torch.zeros(0), torch.zeros(0), torch.zeros(0, 3), torch.zeros(201, dtype=torch.long), torch.arange(200)
+    plain, woven = ([torch.zeros_like(p) for p in (tables, *nets)] for _ in range(2))
+    done = cpu.train_step(batch, *place, field, aim, plain)
+    unwanted = reference.Unwanted(torch.zeros(16**3), None)
+    again = cpu.woven_step(batch, reference.Fixed(*nothing), unwanted, *place, field, aim, woven)
+    assert again.loss == pytest.approx(done.loss, rel=1e-6) and torch.equal(again.cells, done.cells)
+    for a, b in zip(woven, plain):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
+
+
 def test_hash_density_is_the_field_s() -> None:
     torch.manual_seed(10)
     for levels, width, samples in ((10, 32, 3001), (3, 8, 5), (2, 20, 0)):

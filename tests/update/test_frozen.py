@@ -91,3 +91,13 @@ def test_the_optical_depth_passes_gradients_to_the_helper_only_where_it_shows() 
         shown(fixed, sample, sigma, torch.zeros(1, 3)).sum().backward()
         assert sigma.grad is not None
         assert bool(sigma.grad.abs().sum() > 1e-8) is learns
+
+
+def test_nothing_is_left_beyond_a_distance() -> None:
+    fixed = Segments(
+        torch.tensor([1.0, 3.0, 2.0, 5.0]), torch.ones(4), torch.arange(12.0).reshape(4, 3), torch.tensor([0, 2, 2, 4])
+    )
+    near = fixed.before(torch.tensor([2.0, 9.0, torch.inf]))
+    assert near.offsets.tolist() == [0, 1, 1, 3] and near.t_mid.tolist() == [1.0, 2.0, 5.0]
+    both = near.followed_by(fixed)
+    assert both.offsets.tolist() == [0, 1, 1, 3, 5, 5, 7] and torch.equal(both[torch.tensor([3])].rgb, fixed.rgb[:2])

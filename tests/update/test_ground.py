@@ -1,12 +1,14 @@
 """Where something stood on a plane, all above the plane is empty once it has left."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from refield.scene.capture import Rays
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.planes import Plane
-from refield.update.ground import planes_around
+from refield.update.ground import Foothold, footholds, planes_around
 from refield.update.helper import emptiness
 from refield.update.region import Region, meets, move_out
 
@@ -29,7 +31,7 @@ def floor_points(count):
 def asked(change, x, planes, taken=()):
     """What `emptiness` says at world points (N, 3)."""
     cells = move_out(change, 1.5).sampler(0.02)
-    return emptiness(change, cells, Region(taken), planes)[cells.cells(x)]
+    return emptiness(change, cells, Region(taken), footholds(change, planes))[cells.cells(x)]
 
 
 def test_the_floor_is_found_around_what_left():
@@ -50,9 +52,42 @@ def test_above_the_floor_that_it_stood_on_is_nothing():
     assert (asked(standing, skin, ()) == 0).all()  # another thing may have been there, as far as is known
     assert (asked(standing, skin, planes) == 0.5).all()
     assert (asked(standing, skin, planes, (box_at(0.0).grid,)) == 0).all()  # something stands there now
-    assert (asked(standing, ground, planes) == 0).all()
+    at, near = asked(standing, ground, planes).tolist()
+    assert at < 0.05 < near < 0.3  # the less so the nearer
     outside = torch.tensor([[0.26, 0.0, 0.2]])
     assert (asked(standing, outside, planes) == 0).all()
+
+
+def test_beneath_the_floor_is_nothing_either_the_less_so_the_nearer():
+    standing = SceneChange((box_at(0.0),))
+    planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]
+    under = torch.tensor([[0.0, 0.0, z] for z in (0.0, -0.03, -0.09)])
+    at, near, deep = asked(standing, under, planes).tolist()
+    assert at < 0.1 < near < 0.5 == deep
+    assert (asked(standing, under, ()) == 0).all()
+    beside = torch.tensor([[0.3, 0.0, -0.09]])
+    assert (asked(standing, beside, planes) == 0).all()  # the edge of a table, as far as is known
+
+
+def test_rays_enter_the_ground_where_the_object_stood_and_only_from_above():
+    (foothold,) = footholds(SceneChange((box_at(0.0),)), [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)])
+    down, level = [0.0, 0.6, -0.8], [0.0, 1.0, 0.0]
+    rays = Rays(
+        torch.tensor([[0.0, -0.75, 1.0], [0.0, 0.75, 1.0], [0.0, 0.0, 0.3], [0.0, 0.0, -1.0]]),
+        torch.tensor([down, down, level, [0.0, 0.0, 1.0]]),
+    )
+    torch.testing.assert_close(foothold.entered(rays), torch.tensor([1.25] + 3 * [torch.inf]))
+    assert footholds(SceneChange((box_at(0.3),)), [foothold.plane]) == []
+    assert isinstance(foothold, Foothold) and foothold.holds(torch.tensor([[0.0, 0.0, -5.0]])).all()
+
+
+def test_what_was_looked_through_is_empty_and_what_was_hidden_is_not_known():
+    cells = move_out(SceneChange((box_at(0.0),)), 1.5).sampler(0.02)
+    possible = cells.grid.clone()
+    free = torch.tensor([[0.26, 0.0, 0.2]])
+    possible.view(-1)[cells.cells(free)] = 0
+    found = emptiness(SceneChange((box_at(0.0),)), cells, Region(()), (), replace(cells, grid=possible))
+    assert found[cells.cells(free)] == 1 and found[cells.cells(torch.tensor([[0.0, 0.0, -0.05]]))] == 0
 
 
 def test_a_plane_that_it_did_not_touch_says_nothing():

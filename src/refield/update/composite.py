@@ -8,6 +8,7 @@ cut out: nothing is left inside them.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 
 import torch
@@ -116,7 +117,9 @@ class UpdatedField:
             sampler = pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES)
         self.sampler = sampler
         self._base: HashField | None = _base_of(pretrained)
-        self._retold = self._retold_cells()
+        self._told = self._told_cells()
+        # a cell whose centre is just outside may hold a corner that is inside
+        self._retold = functional.max_pool3d(self._told[None, None].float(), 3, 1, 1)[0, 0].to(torch.uint8)
         before = pretrained._marched if isinstance(pretrained, UpdatedField) else ()
         self._marched: tuple[Tensor, ...] = tuple(_by_cells(self.sampler, b) for b in self.boxes) + before
 
@@ -124,6 +127,13 @@ class UpdatedField:
     def to_learn(self) -> SceneChange:
         """The change without the objects about which an earlier visit knows everything."""
         return _part(self.change, self.skipped | {origin.object for origin in self.earlier.left})
+
+    def unshown(self, cells: Tensor) -> UpdatedField:
+        """The same field, empty in those of its sampler's cells (flat indices) that nothing new answers for."""
+        out, grid = copy(self), self.sampler.grid.clone()
+        grid.view(-1)[cells] *= self._told.view(-1)[cells]
+        out.sampler = replace(self.sampler, grid=grid)
+        return out
 
     def samples(self, rays: Rays, jitter: bool = False) -> Samples:
         """Where to evaluate the field along rays; nothing behind the first opaque surface that never changed.
@@ -146,10 +156,10 @@ class UpdatedField:
         counts = near.new_zeros(len(rays)).index_copy(0, near, found.ray_offsets.diff())
         return Samples(found.t_starts, found.t_ends, torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
 
-    def _retold_cells(self) -> Tensor:
-        """(R, R, R) uint8: cells in which some point is answered for by a move, a helper or nobody, at this visit or
-        an earlier one."""
-        earlier = self.pretrained._retold if isinstance(self.pretrained, UpdatedField) else None
+    def _told_cells(self) -> Tensor:
+        """(R, R, R) uint8: cells whose centre is answered for by a move, a helper or nobody, at this visit or an
+        earlier one."""
+        earlier = self.pretrained._told if isinstance(self.pretrained, UpdatedField) else None
         grid = torch.zeros_like(self.sampler.grid) if earlier is None else earlier.clone()
         for box in self.boxes:
             cells = self.sampler.cells_in(box)
@@ -159,8 +169,7 @@ class UpdatedField:
             told[to.helper] = True
             told[to.ground] = True
             grid.view(-1)[cells[told]] = 1
-        # a cell whose centre is just outside may hold a corner that is inside
-        return functional.max_pool3d(grid[None, None].float(), 3, 1, 1)[0, 0].to(torch.uint8)
+        return grid
 
     def density(self, x: Tensor) -> Tensor:
         """World points (..., 3) -> sigma (...,), per world unit."""

@@ -30,8 +30,10 @@ class UpdateConfig:
     """Adam's learning rate, held for the first half, then brought down to a thirtieth"""
     distortion: float = 1e-2
     """weight of the distortion loss"""
-    emptiness: float = 2e-2
-    """weight of the colour that comes from deep inside what an object left: solid things stood in nothing"""
+    gradient_unit: float = 1.0
+    """gradient scaling reaches 1 at this many core radii of the old field from the camera (§10.1)"""
+    emptiness: float = 5e-2
+    """weight of the colour that comes from where nothing can be: deep inside what left, where nothing was before"""
     held_out: int = 20
     """every so-many-th pixel that could teach is kept to judge by"""
     check_every: int = 50

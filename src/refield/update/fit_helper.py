@@ -10,16 +10,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from refield.field import kernels
 from refield.field.fit import NonFiniteError, TableAdam, rate_factor
-from refield.field.losses import colour_loss, distortion_loss
+from refield.field.kernels.reference import Aim, Batch, Fixed, Unwanted
 from refield.field.radiance import HashField
+from refield.field.sampling import STOP, OccupancySampler
 from refield.field.volrend import Samples, accumulate_rgb
 from refield.scene.capture import Rays
-from refield.scene.planes import Plane
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.frozen import Segments, Woven, weave
-from refield.update.helper import HelperOccupancy, emptiness
+from refield.update.ground import Foothold
+from refield.update.helper import HelperOccupancy, emptiness, without_directions
 from refield.update.region import Region
 from refield.update.supervision import Lessons
 
@@ -45,6 +47,11 @@ class Lit:
     fixed: Segments
 
 
+def joined(a: Lit, b: Lit) -> Lit:
+    """The rays of both, ``a``'s first."""
+    return Lit(a.lessons.followed_by(b.lessons), a.fixed.followed_by(b.fixed))
+
+
 class HelperTraining:
     """One run: the helper between fixed segments, until held-out pixels stop gaining."""
 
@@ -56,12 +63,16 @@ class HelperTraining:
         old: Lit,
         judge: Lit,
         config: UpdateConfig,
-        planes: Sequence[Plane] = (),
+        ground: Sequence[Foothold] = (),
+        possible: OccupancySampler | None = None,
     ) -> None:
         self.helper, self.config, self.frozen = helper, config, frozen
-        self.sparse, self.old, self.judge = sparse, old, judge
+        self.taught, self.new_rays, self.judge = joined(sparse, old), len(sparse.lessons), judge
         added = tuple(o.grid for o in frozen.change.objects if o.kind == "added")
-        self.empty = emptiness(frozen.change, helper.sampler, Region(added + frozen.bare.grids), planes)
+        taken = Region(added + frozen.bare.grids)
+        self.misplaced = config.emptiness * emptiness(
+            frozen.change, helper.sampler, taken, ground, frozen.pretrained.sampler
+        )
         self.occupancy = HelperOccupancy(helper)
         self.adam = TableAdam(helper)
         self.rays_per_step, self.steps_done = 1024, 0
@@ -119,62 +130,54 @@ class HelperTraining:
         out = []
         with torch.no_grad():
             for chosen in torch.arange(len(lit.lessons)).split(_CHUNK):
-                woven, _, _ = self._woven(lit.lessons[chosen].rays, lit.fixed[chosen], jitter=False)
+                woven = self._woven(lit.lessons[chosen].rays, lit.fixed[chosen])
                 out.append(accumulate_rgb(woven.weights, woven.rgb, woven.samples)[0])
         return torch.cat(out).clamp(0, 1)
 
-    def _batch(self) -> tuple[Rays, Tensor, Segments]:
-        """Rays of a step, the new photos' share of them first."""
-        n_sparse = round(self.rays_per_step * self.config.sparse_share) if len(self.old.lessons) else self.rays_per_step
-        drawn = []
-        for lit, n in ((self.sparse, n_sparse), (self.old, self.rays_per_step - n_sparse)):
-            if n and len(lit.lessons):
-                chosen = torch.randint(len(lit.lessons), (n,))
-                drawn.append((lit.lessons[chosen], lit.fixed[chosen]))
-        rays = Rays(torch.cat([a.rays.origins for a, _ in drawn]), torch.cat([a.rays.directions for a, _ in drawn]))
-        return rays, torch.cat([a.rgb for a, _ in drawn]), _joined([b for _, b in drawn])
-
-    def _woven(self, rays: Rays, fixed: Segments, jitter: bool) -> tuple[Woven, Tensor, Tensor]:
-        """The batch's row of samples; positions (S, 3) and densities (S,) of the helper's own."""
-        samples = self._outside_moved(self.helper.samples(rays, jitter), rays)
-        x, d = samples.positions(rays)
-        sigmas, rgbs = self.helper(x, d)
-        return weave(fixed, samples, sigmas, rgbs), x, sigmas
+    def _woven(self, rays: Rays, fixed: Segments) -> Woven:
+        """The row of samples of each ray, without gradients."""
+        samples = self._outside_moved(self.helper.samples(rays), rays)
+        return weave(fixed, samples, *self.helper(*samples.positions(rays)))
 
     def _outside_moved(self, samples: Samples, rays: Rays) -> Samples:
         """Without the samples inside what moved in (§10.1.2)."""
         x, _ = samples.positions(rays)
-        taken = self.frozen.arrived(x) >= 0
+        taken = self._taken(x)
         if not taken.any():
             return samples
         kept = torch.bincount(samples.ray_ids[~taken], minlength=len(rays))
         offsets = torch.cat([kept.new_zeros(1), kept.cumsum(0)])
         return Samples(samples.t_starts[~taken], samples.t_ends[~taken], offsets)
 
+    def _taken(self, x: Tensor) -> Tensor:
+        return self.frozen.arrived(x) >= 0
+
+    def _drawn(self) -> Tensor:
+        """Rays of a step, (N,) int64: the new photos' share of them first."""
+        n, new, old = self.rays_per_step, self.new_rays, len(self.taught.lessons) - self.new_rays
+        n_new = n if not old else round(n * self.config.sparse_share) if new else 0
+        return torch.cat([torch.randint(max(new, 1), (n_new,)), new + torch.randint(max(old, 1), (n - n_new,))])
+
     def _step(self, step: int, rate: float) -> None:
-        rays, truth, fixed = self._batch()
-        woven, x, sigmas = self._woven(rays, fixed, jitter=True)
-        w = woven.weights
-        rgb, opacity = accumulate_rgb(w, woven.rgb, woven.samples)
-        rgb = rgb + (1 - opacity)[:, None] * torch.rand(len(rays), 3)
-        radius = self.helper.contraction.radius
-        loss = colour_loss(rgb, truth) + self.config.distortion * distortion_loss(w, woven.samples, radius)
-        own = w[woven.own]
-        cells = self.helper.sampler.cells(x)
-        loss = loss + self.config.emptiness * (own * self.empty[cells]).sum() / len(rays)
-        self.adam.backward(loss)
-        if not self.adam.step(rate, float(loss.detach())):
+        chosen, helper, c = self._drawn(), self.helper, self.config
+        n, lessons, fixed = len(chosen), self.taught.lessons, self.taught.fixed
+        rays, sampler = lessons.rays[chosen], helper.sampler
+        # what stays transparent is shown noise, so that only opaque surfaces explain the photos
+        batch = Batch((rays.origins, rays.directions, torch.rand(n)), lessons.rgb[chosen], torch.rand(n, 3))
+        done = kernels.woven_step(
+            batch,
+            Fixed(fixed.t_mid, fixed.optical_depth, fixed.rgb, fixed.offsets, chosen),
+            Unwanted(self.misplaced, self._taken if self.frozen.moves else None),
+            (sampler.contraction.centre, sampler.contraction.radius),
+            sampler.grid,
+            sampler.lattice,
+            (helper.encoding.tables, helper.encoding.resolutions, helper.networks),
+            Aim(c.distortion, c.gradient_unit * self.frozen.sampler.contraction.radius, STOP),
+            self.adam.grads,
+        )
+        without_directions(helper, self.adam.grads)
+        if not self.adam.step(rate, done.loss):
             return
-        self.occupancy.observe(step, cells, own.detach(), sigmas.detach())
-        per_ray = max(len(x) / len(rays), 0.5)
-        self.rays_per_step = int(min(max(self.config.samples / per_ray, 1024), 8192))
-
-
-def _joined(parts: list[Segments]) -> Segments:
-    counts = torch.cat([p.offsets.diff() for p in parts])
-    return Segments(
-        torch.cat([p.t_mid for p in parts]),
-        torch.cat([p.optical_depth for p in parts]),
-        torch.cat([p.rgb for p in parts]),
-        torch.cat([counts.new_zeros(1), counts.cumsum(0)]),
-    )
+        self.occupancy.observe(step, done.cells, done.weights, done.sigmas)
+        per_ray = max(len(done.cells) / n, 0.5)
+        self.rays_per_step = int(min(max(c.samples / per_ray, 1024), 8192))

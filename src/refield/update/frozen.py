@@ -9,11 +9,13 @@ samples. Letters: N rays, K segments of all rays, ``offsets`` (N + 1,) their pre
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
 
 from refield.field import kernels
+from refield.field.kernels.reference import order_key, places_in_order
 from refield.field.radiance import Field
 from refield.field.render import visible_samples
 from refield.field.sampling import OccupancySampler
@@ -44,6 +46,23 @@ class Segments:
         rows = torch.repeat_interleave(self.offsets[:-1][chosen], counts) + within
         return Segments(self.t_mid[rows], self.optical_depth[rows], self.rgb[rows], offsets)
 
+    def before(self, t: Tensor) -> Segments:
+        """Without what lies beyond a distance (N,) on each ray."""
+        kept, ids = self.t_mid <= t[self.ray_ids], self.ray_ids
+        counts = torch.bincount(ids[kept], minlength=len(t))
+        offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        return Segments(self.t_mid[kept], self.optical_depth[kept], self.rgb[kept], offsets)
+
+    def followed_by(self, more: Segments) -> Segments:
+        """Those of further rays behind them."""
+        counts = torch.cat([self.offsets.diff(), more.offsets.diff()])
+        return Segments(
+            torch.cat([self.t_mid, more.t_mid]),
+            torch.cat([self.optical_depth, more.optical_depth]),
+            torch.cat([self.rgb, more.rgb]),
+            torch.cat([counts.new_zeros(1), counts.cumsum(0)]),
+        )
+
     @property
     def ray_ids(self) -> Tensor:
         """(K,) int64"""
@@ -57,13 +76,7 @@ def composite_once(field: Field, region: OccupancySampler, rays: Rays) -> Segmen
     """
     with torch.no_grad():
         parts = [_composite_chunk(field, region, rays[i : i + _CHUNK]) for i in range(0, max(len(rays), 1), _CHUNK)]
-    counts = torch.cat([p.offsets.diff() for p in parts])
-    return Segments(
-        torch.cat([p.t_mid for p in parts]),
-        torch.cat([p.optical_depth for p in parts]),
-        torch.cat([p.rgb for p in parts]),
-        torch.cat([counts.new_zeros(1), counts.cumsum(0)]),
-    )
+    return reduce(Segments.followed_by, parts)
 
 
 def _composite_chunk(field: Field, region: OccupancySampler, rays: Rays) -> Segments:
@@ -75,7 +88,7 @@ def _composite_chunk(field: Field, region: OccupancySampler, rays: Rays) -> Segm
     tau = (sigmas * (samples.t_ends - samples.t_starts))[some]
     # samples with no place for the helper between them share a segment
     gate = region(rays)
-    before = torch.searchsorted(_key(gate.ray_ids, (gate.t_starts + gate.t_ends) / 2), _key(ray, mid))
+    before = torch.searchsorted(order_key(gate.ray_ids, (gate.t_starts + gate.t_ends) / 2), order_key(ray, mid))
     starts = torch.ones(len(ray), dtype=torch.bool)
     starts[1:] = (ray[1:] != ray[:-1]) | (before[1:] != before[:-1])
     first = starts.nonzero()[:, 0]
@@ -87,11 +100,6 @@ def _composite_chunk(field: Field, region: OccupancySampler, rays: Rays) -> Segm
     counts = torch.bincount(ray[first], minlength=len(rays))
     offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
     return Segments(summed[:, 3] / opacity, depth, summed[:, :3] / opacity[:, None], offsets)
-
-
-def _key(ray: Tensor, t: Tensor) -> Tensor:
-    """Sorts by ray, then by distance; (S,) float64. Distances are squashed to [0, 1), in order."""
-    return ray.double() + t.double() / (1 + t.double())
 
 
 @dataclass(frozen=True)
@@ -120,9 +128,7 @@ class Woven:
 def weave(fixed: Segments, samples: Samples, sigmas: Tensor, rgbs: Tensor) -> Woven:
     """Put the helper's samples (S,) of the same rays between the fixed segments (Eq. 4)."""
     mid = (samples.t_starts + samples.t_ends) / 2
-    key_own, key_fixed = _key(samples.ray_ids, mid), _key(fixed.ray_ids, fixed.t_mid)
-    own = torch.arange(len(key_own)) + torch.searchsorted(key_fixed, key_own)
-    other = torch.arange(len(key_fixed)) + torch.searchsorted(key_own, key_fixed, right=True)
+    own, other = places_in_order(samples.ray_ids, mid, fixed.ray_ids, fixed.t_mid)
     n = len(own) + len(other)
     tau = sigmas * (samples.t_ends - samples.t_starts)
     t_mid = mid.new_zeros(n).index_copy(0, own, mid).index_copy(0, other, fixed.t_mid)

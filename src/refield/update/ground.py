@@ -5,12 +5,59 @@ A few new photos agree on many geometries; what is known of the ground keeps haz
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
 import torch
 from torch import Tensor
 
+from refield.scene.capture import Rays
+from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.planes import Plane, rough_planes
 
 _POINTS = 6000  # that planes are looked for among
+_REACH = 0.12  # of an object's mean side: so near to a plane an object has to come to have stood on it
+
+
+def footholds(change: SceneChange, planes: Sequence[Plane]) -> list[Foothold]:
+    """Where the objects that left, or moved, had touched planes."""
+    found: list[Foothold] = []
+    for o in change.objects:
+        occupied = o.grid.occupied().numpy()
+        if o.kind == "added" or not len(occupied):
+            continue
+        reach = _REACH * float(o.grid.tight_aabb().diff(dim=0).mean())
+        touched = (p for p in planes if abs(float(np.quantile(p.height(occupied), 0.02))) < reach)
+        found += [Foothold(p, o.grid, reach) for p in touched]
+    return found
+
+
+@dataclass(frozen=True)
+class Foothold:
+    """A part of a plane on which an object stood or against which it leant."""
+
+    plane: Plane
+    grid: OccupancyGrid
+    """the object's"""
+    reach: float
+    """world units above the plane, where the object is asked whether it stood there"""
+
+    def holds(self, x: Tensor) -> Tensor:
+        """Whether world points (N, 3) lie above or beneath it, (N,) bool."""
+        normal = torch.from_numpy(self.plane.normal).to(x.dtype)
+        height = torch.from_numpy(self.plane.height(x.numpy()))
+        return self.grid.contains(x + (self.reach - height)[:, None] * normal)
+
+    def entered(self, rays: Rays) -> Tensor:
+        """Distances (N,) at which rays go through it from the front; infinite where they do not."""
+        normal = torch.from_numpy(self.plane.normal).to(rays.origins.dtype)
+        down = -(rays.directions @ normal)
+        t = torch.from_numpy(self.plane.height(rays.origins.numpy())) / down.clamp_min(1e-6)
+        met = (down > 1e-6) & (t > 0)
+        rows = met.nonzero()[:, 0]
+        met[rows] = self.holds(rays.origins[rows] + t[rows, None] * rays.directions[rows])
+        return torch.where(met, t, torch.inf)
 
 
 def planes_around(points: Tensor, box: Tensor, eyes: Tensor, resolved: float) -> list[Plane]:

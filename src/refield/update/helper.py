@@ -15,13 +15,13 @@ from refield.field.radiance import Field, HashField, HashFieldConfig
 from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Frame
 from refield.scene.change import SceneChange
-from refield.scene.planes import Plane
+from refield.update.ground import Foothold
 from refield.update.region import Region
 
 _OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
 _WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
-_RIM = 0.5  # as empty as this is the rim of what stood on a plane, above the plane
-_BAND = 2.5  # cells above what an object stood on that may hold its surface
+_RIM = 0.5  # as empty as this is the rim of what stood on a plane, and everything beneath the plane
+_BAND = 2.5  # cells above and beneath what an object stood on over which it becomes so empty
 _DEPTH = 0.12  # of an object's mean side: so far inside, nothing that stood there can have been
 
 
@@ -34,12 +34,15 @@ def new_helper(region: OccupancySampler, frames: tuple[Frame, ...], seed: int) -
     pixel = min(float((f.centre.float() - space.centre).norm()) / max(f.camera.fx, f.camera.fy) for f in frames)
     finest = int(min(max(4 * space.radius / (1.5 * pixel), 64), 2048))
     helper = HashField(HashFieldConfig(levels=8, coarsest=16, finest=finest, log2_table=15), region, seed)
-    learnt = torch.ones_like(helper.colour_in)
-    learnt[:, helper.config.geometry_features + 1 :] = 0  # all harmonics but the constant one
     with torch.no_grad():
-        helper.colour_in.mul_(learnt)
-    helper.colour_in.register_hook(lambda grad: grad * learnt)
+        without_directions(helper, [helper.encoding.tables, *helper.networks])
     return helper
+
+
+def without_directions(helper: HashField, into: list[Tensor]) -> None:
+    """Zero what belongs to all harmonics of the direction but the constant one, of tensors shaped as the helper's
+    tables and matrices."""
+    into[3][:, helper.config.geometry_features + 1 :] = 0
 
 
 def step_near(field: Field, point: Tensor) -> float:
@@ -49,15 +52,24 @@ def step_near(field: Field, point: Tensor) -> float:
     return s.step * max(reach, 1.0) ** 1.5
 
 
-def emptiness(change: SceneChange, cells: OccupancySampler, taken: Region, planes: Sequence[Plane] = ()) -> Tensor:
-    """How deep inside an object that left each cell lies, (R**3,) float32: 0 outside and at its surface, 1 deep inside.
+def emptiness(
+    change: SceneChange,
+    cells: OccupancySampler,
+    taken: Region,
+    ground: Sequence[Foothold] = (),
+    possible: OccupancySampler | None = None,
+) -> Tensor:
+    """How surely nothing is in each cell, (R**3,) float32: 0 where there may be something, 1 where nothing can be.
 
-    What stood in the way of everything is not there any more; only near its surface may something else begin: the
-    ground under it, the wall behind it. Where that is one of ``planes``, what is above it near the surface is half as
-    empty: a wall that it leant on may not be among them. 0 in ``taken``, where something stands now.
+    What stood in the way of everything is not there any more: deep inside an object that left is nothing, and only
+    near its surface may something else begin: the ground under it, the wall behind it. Where that is one of
+    ``ground``, it is there, and the more so the nearer to it; what is above it near the object's surface is half as
+    empty, since a wall that the object leant on may not be among them. Where ``possible`` does not
+    look, nothing is. 0 in ``taken``, where something stands now.
     """
     r = cells.resolution
     depth = torch.zeros(r**3)
+    cell = 4 * cells.contraction.radius / r
     centres = cells.points_in(torch.arange(r**3), jitter=False)
     for o in change.objects:
         if o.kind == "added":
@@ -67,15 +79,24 @@ def emptiness(change: SceneChange, cells: OccupancySampler, taken: Region, plane
             continue
         box = o.grid.tight_aabb()
         reach = float((box[1] - box[0]).mean()) * _DEPTH
-        cell = 4 * cells.contraction.radius / r
         distance = torch.from_numpy(distance_transform_edt(inside.numpy())).float().reshape(-1) * cell
         depth = torch.maximum(depth, (distance / reach - 1).clamp(0, 1))
-        touched = [p for p in planes if abs(float(np.quantile(p.height(o.grid.occupied().numpy()), 0.02))) < reach]
-        if touched:
-            above = [p.height(centres.numpy()) > max(_BAND * cell, 2 * p.noise) for p in touched]
+        above = [f.plane.height(centres.numpy()) > _band(f, cell) for f in ground if f.grid is o.grid]
+        if above:
             free = inside.reshape(-1) & torch.from_numpy(np.logical_and.reduce(above))
             depth[free] = depth[free].clamp_min(_RIM)
+    for foothold in ground:
+        height, band = torch.from_numpy(foothold.plane.height(centres.numpy())), _band(foothold, cell)
+        off = ((height.abs() - 2 * foothold.plane.noise) / band).clamp(0, 1)
+        here = (height < band) & foothold.holds(centres)
+        depth[here] = torch.maximum(depth[here], _RIM * off[here])
+    if possible is not None:
+        depth[~possible.occupied(centres)] = 1.0
     return torch.where(taken.contains(centres), 0.0, depth) if taken.grids else depth
+
+
+def _band(foothold: Foothold, cell: float) -> float:
+    return max(_BAND * cell, 2 * foothold.plane.noise)
 
 
 class HelperOccupancy:

@@ -43,6 +43,13 @@ class Lessons:
     def __getitem__(self, chosen: Tensor | slice) -> Lessons:
         return Lessons(self.rays[chosen], self.rgb[chosen], self.photo[chosen])
 
+    def followed_by(self, more: Lessons) -> Lessons:
+        """These and then more."""
+        origins = torch.cat([self.rays.origins, more.rays.origins])
+        directions = torch.cat([self.rays.directions, more.rays.directions])
+        colours, photos = torch.cat([self.rgb, more.rgb]), torch.cat([self.photo, more.photo])
+        return Lessons(Rays(origins, directions), colours, photos)
+
 
 @dataclass(frozen=True)
 class Place:

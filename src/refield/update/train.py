@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -16,22 +16,22 @@ from refield.field.radiance import Field
 from refield.field.render import render_many
 from refield.field.sampling import OccupancySampler
 from refield.field.warp import outline
-from refield.scene.capture import Capture, Frame, centres
+from refield.scene.capture import Capture, Frame, Rays, centres
 from refield.scene.change import SceneChange
-from refield.scene.planes import Plane
 from refield.scene.pose import transform
 from refield.update.bare import bare_skin
 from refield.update.composite import UpdatedField, leaving
 from refield.update.config import UpdateConfig
 from refield.update.evidence import as_remembered, recalled_pixels
 from refield.update.fit_helper import HelperTraining, Lit, UpdateProgress
-from refield.update.frozen import composite_once
-from refield.update.ground import planes_around
+from refield.update.frozen import Segments, composite_once
+from refield.update.ground import Foothold, footholds, planes_around
 from refield.update.helper import new_helper, step_near
 from refield.update.light import Relighting, Sightings, fit_light
 from refield.update.recall import earlier_of
 from refield.update.region import Region, meets, move_out
 from refield.update.supervision import Lessons, changed_pixels, new_lessons, old_ring, places_of
+from refield.update.unseen import sight_of
 from refield.vision.pixels import dilate
 
 DEFAULTS = UpdateConfig()
@@ -91,25 +91,28 @@ def update_field(
     step = step_near(field, middle)
     region = _in_reach(wide.sampler(step), capture.train + change.frames)
     # what earlier visits know has been taken from them already; of the rest no old photo shows anything
-    old, planes = known.sparse[:0], list[Plane]()
+    old, ground = known.sparse[:0], list[Foothold]()
     if cut.to_learn.objects:
         old, depth = _old_lessons(capture, cut, region, config, light)
         around = old.rays.origins + old.rays.directions * depth[:, None]
         planes = planes_around(around, wide.box, eyes, max(_pixel(change, middle), step))
+        ground = footholds(cut.to_learn, planes)
     sparse = known.sparse[meets(region, known.sparse.rays).nonzero()[:, 0]]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
     say("freeze")
-    frozen = lit(region=wide)
-    new_taught, judge = _split(Lit(sparse, composite_once(frozen, region, sparse.rays)), config.held_out)
-    old_taught = Lit(old, composite_once(frozen, region, old.rays))
+    beside = [torch.stack([2 * b[0] - b[1], 2 * b[1] - b[0]]) for b in wide.boxes]
+    sight = sight_of(field, capture.train, beside)
+    frozen = lit(region=wide).unshown(sight.hidden)
+    new_taught, judge = _split(Lit(sparse, _fixed(frozen, region, sparse.rays, ground)), config.held_out)
+    old_taught = Lit(old, _fixed(frozen, region, old.rays, ground))
     say("train")
     helper = new_helper(region, change.frames, config.seed)
-    run = HelperTraining(helper, frozen, new_taught, old_taught, judge, config, planes)
+    run = HelperTraining(helper, frozen, new_taught, old_taught, judge, config, ground, sight.possible)
     run.run(on_progress)
     say("show")
     helper.requires_grad_(False)
-    updated = lit(helper=helper, region=wide)
+    updated = lit(helper=helper, region=wide).unshown(sight.hidden)
     updated.why_stopped = run.why_stopped
     return updated
 
@@ -139,6 +142,15 @@ def _known_of(capture: Capture, field: Field, cut: UpdatedField) -> _Known:
         empty = Region(cut.region.grids + bare.grids)
         cut = UpdatedField(cut.pretrained, change, region=empty, eyes=eyes, bare=bare, earlier=cut.earlier)
     return _Known(cut, sparse, changed)
+
+
+def _fixed(frozen: UpdatedField, region: OccupancySampler, rays: Rays, ground: Sequence[Foothold]) -> Segments:
+    """What is fixed along rays. Nothing beyond the ground that an object stood on: nobody has ever looked through it,
+    and where the old field's inside shows as through a mist, a helper needs not become solid."""
+    fixed = composite_once(frozen, region, rays)
+    for foothold in ground:
+        fixed = fixed.before(foothold.entered(rays))
+    return fixed
 
 
 def _split(lit: Lit, every: int) -> tuple[Lit, Lit]:

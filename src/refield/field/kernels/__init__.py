@@ -12,7 +12,18 @@ from types import ModuleType
 from torch import Tensor
 
 from refield.field.kernels import reference
-from refield.field.kernels.reference import Aim, Batch, DensityNet, Lattice, Networks, Rays3, Space, Stepped
+from refield.field.kernels.reference import (
+    Aim,
+    Batch,
+    DensityNet,
+    Fixed,
+    Lattice,
+    Networks,
+    Rays3,
+    Space,
+    Stepped,
+    Unwanted,
+)
 
 
 def _twin(t: Tensor) -> ModuleType:
@@ -102,6 +113,21 @@ def train_step(
 ) -> Stepped:
     """See `reference.train_step`."""
     return _twin(grid).train_step(batch, space, grid, lattice, field, aim, into)
+
+
+def woven_step(
+    batch: Batch,
+    fixed: Fixed,
+    unwanted: Unwanted,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    aim: Aim,
+    into: list[Tensor],
+) -> Stepped:
+    """See `reference.woven_step`."""
+    return _twin(grid).woven_step(batch, fixed, unwanted, space, grid, lattice, field, aim, into)
 
 
 def observe(state: Tensor, now: int, decay: float, cells: Tensor, w: Tensor, sigmas: Tensor) -> None:

@@ -7,6 +7,7 @@ Every function here is differentiable by autograd where its twin is.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -57,6 +58,30 @@ class Stepped(NamedTuple):
     sigmas: Tensor
     """(S,) per world unit"""
     rays: int
+
+
+class Fixed(NamedTuple):
+    """What lies along rays and cannot change: segments, near to far, of M rays."""
+
+    t_mid: Tensor
+    """(K,) where each segment's light comes from"""
+    optical_depth: Tensor
+    """(K,)"""
+    rgb: Tensor
+    """(K, 3) as if it were opaque"""
+    offsets: Tensor
+    """(M + 1,) int64"""
+    chosen: Tensor
+    """(N,) int64: which of the M each ray of a batch is"""
+
+
+class Unwanted(NamedTuple):
+    """Where a helper is not to show anything."""
+
+    misplaced: Tensor
+    """(R**3,) what a unit of weight in each cell adds to the loss"""
+    taken: Callable[[Tensor], Tensor] | None
+    """World points (S, 3) -> (S,) bool: where it is not asked"""
 
 
 PRIMES = (1, 2654435761, 805459861)  # the spatial hash of Teschner et al. 2003, as in Instant-NGP, Eq. 4
@@ -345,3 +370,73 @@ def train_step(
     ijk = (unit * r).long().clamp_(0, r - 1)
     cells = (ijk[:, 0] * r + ijk[:, 1]) * r + ijk[:, 2]
     return Stepped(float(loss.detach()), cells, w.detach(), sigmas.detach(), len(offsets) - 1)
+
+
+def woven_step(
+    batch: Batch,
+    fixed: Fixed,
+    unwanted: Unwanted,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    aim: Aim,
+    into: list[Tensor],
+) -> Stepped:
+    """`train_step` with fixed segments between the samples (Eq. 4); they count in the loss as samples of no length.
+
+    The loss has one term more: the mean over rays of what the samples' weights add where they are unwanted.
+    """
+    tables, resolutions, networks = field
+    origins, directions, _ = batch.rays
+    net = (tables.detach(), resolutions, networks[0].detach(), networks[1][0].detach())
+    t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop)
+    ids, mid = _ray_ids(offsets), (t0 + t1) / 2
+    x = origins[ids] + directions[ids] * mid[:, None]
+    if unwanted.taken is not None:
+        t1 = torch.where(unwanted.taken(x), t0, t1)
+    unit = (contract(x, *space) + 2) / 4
+    r = grid.shape[0]
+    ijk = (unit * r).long().clamp_(0, r - 1)
+    cells = (ijk[:, 0] * r + ijk[:, 1]) * r + ijk[:, 2]
+    counts = fixed.offsets.diff()[fixed.chosen]
+    fixed_ids = torch.repeat_interleave(counts)
+    before = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    rows = torch.arange(len(fixed_ids)) - before[fixed_ids] + fixed.offsets[fixed.chosen][fixed_ids]
+    t_mid, depth, shown = fixed.t_mid[rows], fixed.optical_depth[rows], fixed.rgb[rows]
+    own, other = places_in_order(ids, mid, fixed_ids, t_mid)
+    leaves = [p.detach().requires_grad_() for p in (tables, *networks)]
+    with torch.enable_grad():
+        raw, rgbs = hash_field(unit, directions[ids], leaves[0], resolutions, tuple(leaves[1:]))  # type: ignore[arg-type]
+        sigmas = truncated_exp(raw) / space[1]
+        near = (mid / aim.gradient_unit).square().clamp(max=1)
+        n = len(own) + len(other)
+        tau = mid.new_zeros(n).index_copy(0, own, scale_gradient(sigmas, near) * (t1 - t0)).index_copy(0, other, depth)
+        rgb = mid.new_zeros(n, 3).index_copy(0, own, scale_gradient(rgbs, near)).index_copy(0, other, shown)
+        begin = mid.new_zeros(n).index_copy(0, own, t0).index_copy(0, other, t_mid)
+        end = mid.new_zeros(n).index_copy(0, own, t1).index_copy(0, other, t_mid)
+        both = offsets + before
+        w = weights(tau, torch.zeros_like(tau), torch.ones_like(tau), both)
+        total = accumulate(w, torch.cat([rgb, torch.ones_like(w)[:, None]], -1), both)
+        seen = total[:, :3] + (1 - total[:, 3:]) * batch.background
+        s0, s1 = (t / (t + space[1]) for t in (begin, end))
+        loss = (seen - batch.colours).square().mean() + aim.distortion * distortion(w, s0, s1, both).mean()
+        loss = loss + (w[own] * unwanted.misplaced[cells]).sum() / len(batch.colours)
+    for into_one, grad in zip(into, torch.autograd.grad(loss, leaves)):
+        into_one += grad
+    return Stepped(float(loss.detach()), cells, w[own].detach(), sigmas.detach(), len(both) - 1)
+
+
+def places_in_order(ids: Tensor, t: Tensor, other_ids: Tensor, other_t: Tensor) -> tuple[Tensor, Tensor]:
+    """Two packed sets of the same rays as one, ray by ray and near to far: the places (S,), (K,) of each one's items.
+
+    Rays (int64) and distances of either; at the same distance the first set comes first.
+    """
+    a, b = order_key(ids, t), order_key(other_ids, other_t)
+    own = torch.arange(len(a)) + torch.searchsorted(b, a)
+    return own, torch.arange(len(b)) + torch.searchsorted(a, b, right=True)
+
+
+def order_key(ray: Tensor, t: Tensor) -> Tensor:
+    """Sorts by ray, then by distance; (S,) float64. Distances are squashed to [0, 1), in order."""
+    return ray.double() + t.double() / (1 + t.double())

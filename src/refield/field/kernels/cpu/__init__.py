@@ -10,6 +10,7 @@ from refield.field.kernels.cpu.networks import hash_field
 from refield.field.kernels.cpu.optimiser import adam, keep, observe, scatter_max
 from refield.field.kernels.cpu.rays import accumulate, contract, distortion, spherical_harmonics, weights
 from refield.field.kernels.cpu.step import train_step
+from refield.field.kernels.cpu.woven import woven_step
 
 __all__ = [
     "accumulate",
@@ -27,4 +28,5 @@ __all__ = [
     "spherical_harmonics",
     "train_step",
     "weights",
+    "woven_step",
 ]

@@ -5,6 +5,8 @@ March (with the encoding) → for each group of rays: networks, compositing, los
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from numba import njit, prange
@@ -29,7 +31,7 @@ _ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.floa
 
 
 @njit(**JIT)
-def _prepare(first, n, raw, t0, t1, radius, unit, sigma, scratch):  # type: ignore[no-untyped-def]
+def prepare(first, n, raw, t0, t1, radius, unit, sigma, scratch):  # type: ignore[no-untyped-def]
     """What each sample of a block needs, in straight loops: its density, and five numbers into ``scratch`` (5, n)."""
     clear, mid, length, near, delta = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
     for k in range(n):
@@ -116,7 +118,7 @@ def _group(begin, end, found, batch, sizes, packed, aim, outs, sums):  # type: i
             for i in range(offsets[q] - first, offsets[q + 1] - first):
                 d[i, 0], d[i, 1], d[i, 2] = directions[q, 0], directions[q, 1], directions[q, 2]
         forward_block(features[first : first + n], d[:n], sizes, packed, room)
-        _prepare(first, n, room[2][:, 0], t0, t1, aim[0], aim[2], sigma, scratch)
+        prepare(first, n, room[2][:, 0], t0, t1, aim[0], aim[2], sigma, scratch)
         for q in range(r, last):
             told = (colours[q], background[q])
             loss += _along_ray(
@@ -161,24 +163,52 @@ def after_march(
     into: list[Tensor],
 ) -> Stepped:
     """The rest of the step, for the samples that marching found; ``resolution``: cells a side of the grid."""
+    told = (array(batch.rays[1]), array(batch.colours), array(batch.background))
+
+    def through(*rest):  # type: ignore[no-untyped-def]
+        _through(tuple(found), told, *rest)
+
+    rays = len(batch.colours)
+    return scattered(found, find_cells(found.unit, resolution), rays, field, toward(aim, space, rays), into, through)
+
+
+def toward(aim: Aim, space: Space, rays: int) -> tuple[np.float32, ...]:
+    """What the loops want to know of the aim."""
+    radius, strength, unit, count = (np.float32(x) for x in (space[1], aim.distortion, aim.gradient_unit, rays))
+    return radius, strength, unit, count
+
+
+def scattered(
+    found: Marched,
+    cells: Tensor,
+    rays: int,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    aim: tuple[np.float32, ...],
+    into: list[Tensor],
+    through: Callable[..., None],
+) -> Stepped:
+    """Go ``through`` all rays, in groups of about as many samples, and add the gradients up."""
     _, resolutions, networks = field
-    n, rays = len(found.t_starts), len(batch.colours)
+    n = len(found.t_starts)
     packed = pack(networks)
     sums = group_sums(packed)
     w, sigmas, losses = torch.empty(n), torch.empty(n), np.zeros(sums[0].shape[0])
     to_features = scratch("to features", found.features.shape)
-    told = (array(batch.rays[1]), array(batch.colours), array(batch.background))
-    numbers = tuple(np.float32(x) for x in (space[1], aim.distortion, aim.gradient_unit, rays))
     outs = (w.numpy(), sigmas.numpy(), to_features)
     bounds = np.searchsorted(found.offsets, n * np.arange(len(losses) + 1) // len(losses))
     bounds[-1] = rays  # those without a sample, too
-    _through(tuple(found), told, sizes_of(networks), packed, numbers, outs, sums, bounds, losses)
+    through(sizes_of(networks), packed, aim, outs, sums, bounds, losses)
     encode_backward(found.unit, to_features.view(np.float64), np.asarray(resolutions, np.int32), pairs(into[0]))
     for total, grad in zip(into[1:], unpack(tuple(s.sum(0) for s in sums), networks)):
         total += grad
-    cells = torch.empty(n, dtype=torch.int64)
-    _find_cells(found.unit, resolution, cells.numpy())
     return Stepped(float(losses.sum()), cells, w, sigmas, rays)
+
+
+def find_cells(unit: np.ndarray, resolution: int) -> Tensor:
+    """Flat index (S,) int64 of the grid cell that holds each position (S, 3) in [0, 1]."""
+    cells = torch.empty(len(unit), dtype=torch.int64)
+    _find_cells(unit, resolution, cells.numpy())
+    return cells
 
 
 @njit(parallel=True, **JIT)

@@ -1,0 +1,74 @@
+"""What the old photos saw: of what they never did nothing is known, though a fitted field has something there, which
+shows once what hid it has left; and what they looked through is empty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from refield.field.radiance import Field
+from refield.field.render import render_camera
+from refield.field.sampling import OccupancySampler
+from refield.scene.capture import Frame
+
+_EYES = 24  # old photos asked, spread over all
+_SIDE = 40  # pixels of their longer side: a cell of the occupancy grid is wider than one of them
+_BEHIND = 1.5  # cells; so far behind the surface a cell may still reach into what was seen
+_BEFORE = 0.5  # and from so far before it on it was looked through
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Which cells of a field's sampler, in some boxes, its photos saw."""
+
+    sampler: OccupancySampler
+    """the field's"""
+    cells: Tensor
+    """(K,) flat indices"""
+    before: Tensor
+    """(K,) by how many cells each lies before the surface that a photo shows there, at most over all photos; negative
+    behind it"""
+
+    @property
+    def hidden(self) -> Tensor:
+        """Flat indices of the cells that no photo saw."""
+        return self.cells[self.before < -_BEHIND]
+
+    @property
+    def possible(self) -> OccupancySampler:
+        """Looks wherever something may be, for all that is known: not into empty cells that were looked through."""
+        grid = torch.ones_like(self.sampler.grid)
+        seen = self.cells[self.before > _BEFORE]
+        grid.view(-1)[seen] = self.sampler.grid.reshape(-1)[seen]
+        return replace(self.sampler, grid=grid)
+
+
+def sight_of(field: Field, frames: Sequence[Frame], boxes: Sequence[Tensor]) -> Sight:
+    """What old photos saw in world boxes (2, 3)."""
+    s = field.sampler
+    cells = torch.cat([s.cells_in(b) for b in boxes]).unique()
+    x = s.points_in(cells, jitter=False)
+    side = 4 * s.contraction.radius / s.resolution * s.distance(cells).clamp_min(1) ** 2  # what is far is contracted
+    before = torch.full((len(cells),), -torch.inf)
+    for frame in frames[:: max(1, len(frames) // _EYES)]:
+        camera = frame.camera.scaled(*_small(frame.camera.width, frame.camera.height))
+        pose = frame.world_from_cam
+        uv, z = camera.project((x - pose[:3, 3].float()) @ pose[:3, :3].float())
+        inside = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+        rows = inside.nonzero()[:, 0]
+        if len(rows) == 0:
+            continue
+        j, i = uv[rows].long().unbind(-1)
+        depth = render_camera(field, camera, pose).depth[i, j]
+        away = (x[rows] - frame.centre.float()).norm(dim=-1)
+        before[rows] = torch.maximum(before[rows], (depth - away) / side[rows])
+    return Sight(s, cells, before)
+
+
+def _small(width: int, height: int) -> tuple[int, int]:
+    part = min(_SIDE / max(width, height), 1.0)
+    return max(round(part * width), 1), max(round(part * height), 1)

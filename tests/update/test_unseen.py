@@ -1,0 +1,56 @@
+"""What the old photos saw of a field that has something where nobody ever looked."""
+
+from __future__ import annotations
+
+import torch
+
+from refield.field.radiance import Field
+from refield.scene.camera import Camera
+from refield.scene.capture import Frame
+from refield.update.composite import UpdatedField
+from refield.update.unseen import sight_of
+from tests.update.worlds import Ball, BallWorld, at, change_of, moved
+
+SHELL = Ball(at(0.0, 0.0, 0.0), 0.5)
+BOX = torch.tensor([[-0.8, -0.8, -0.8], [0.8, 0.8, 0.8]])
+
+
+def frames() -> list[Frame]:
+    """Six photos of the ball, one along each axis and back."""
+    camera = Camera(64, 64, 64.0, 64.0, 32.0, 32.0)
+    out = []
+    for axis in range(3):
+        for side in (-2.0, 2.0):
+            forward = torch.zeros(3, dtype=torch.float64)
+            forward[axis] = -side / 2
+            right = torch.zeros(3, dtype=torch.float64)
+            right[(axis + 1) % 3] = 1
+            pose = torch.eye(4, dtype=torch.float64)
+            pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], -1)
+            pose[:3, 3] = -2 * forward
+            out.append(Frame(camera=camera, world_from_cam=pose, path=None, name=f"{axis}{side}"))  # type: ignore[arg-type]
+    return out
+
+
+def asked(field: Field, x: list[list[float]]) -> tuple[list[bool], list[bool]]:
+    """Of points: whether their cells are hidden, and whether something may be in them."""
+    sight = sight_of(field, frames(), [BOX])
+    cells = field.sampler.cells(torch.tensor(x))
+    return torch.isin(cells, sight.hidden).tolist(), sight.possible.occupied(torch.tensor(x)).tolist()
+
+
+def test_what_lies_inside_is_hidden_and_what_was_looked_through_is_empty() -> None:
+    hidden, possible = asked(BallWorld((SHELL,), floor=False), [[0, 0, 0], [0.5, 0, 0], [0.7, 0, 0], [0, 0, 0.3]])
+    assert hidden == [True, False, False, True]
+    assert possible == [True, True, False, True]  # of what is inside nobody knows
+
+
+def test_hidden_cells_are_not_shown_unless_something_new_answers_for_them() -> None:
+    field = BallWorld((SHELL,), floor=False)
+    cells = sight_of(field, frames(), [BOX]).hidden
+    x = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.2]])
+    change = change_of(moved(Ball(at(0.0, 0.0, 0.0), 0.1), at(2.0, 0.0, 0.0)))
+    updated = UpdatedField(field, change, helper=BallWorld((Ball(at(0.0, 0.0, 0.0), 0.1),), floor=False))
+    assert updated.sampler.occupied(x).all()
+    shown = updated.unshown(cells).sampler.occupied(x)
+    assert shown.tolist() == [True, False] and updated.sampler.occupied(x).all()
