@@ -34,8 +34,8 @@ from tables.watched import stage_seconds, updated
 
 VIEWS = (1, 2, 3, 4, 8, 12, 16)
 """numbers of new photos (§12.2)"""
-LONGER = 5
-"""times as many steps, for the longer re-training"""
+WHOLE, TRAINING = 20, 60
+"""the longer re-training goes on for so many times our whole update, or our training alone, whichever is longer"""
 ALIGNMENTS = {"as rendered": EvaluateConfig(), "aligned": EvaluateConfig(align=True)}
 UNREFINED = EstimateConfig(refine=RefineConfig(steps=(0, 0)))
 """the initial poses (§12.1)"""
@@ -242,9 +242,13 @@ def retrained(lab: Lab, case: Case) -> Record:
 
 
 def retrained_long(lab: Lab, case: Case) -> Record:
-    """Re-training with `LONGER` times the steps, and without stopping before: can more time make up for it?"""
-    config = replace(lab.fit, steps=LONGER * lab.fit.steps, patience=10**6)
-    return _trained(lab, case, "retrained_long", lambda change, curve: retrain(case.capture, change, config, curve))
+    """Re-training for `WHOLE` times our update, with a schedule to match: can more time make up for it?"""
+    first, ours, usual = (run_method(lab, case, m) for m in ("estimate", "ours", "retrained"))
+    seconds = max(WHOLE * (first["total"] + ours["train"]), TRAINING * ours["seconds"]["train"])
+    config = replace(lab.fit, steps=max(math.ceil(seconds * usual["steps"] / usual["train"]), 1), patience=10**6)
+    return _trained(
+        lab, case, "retrained_long", lambda change, curve: retrain(case.capture, change, config, curve), config.steps
+    )
 
 
 def finetuned(lab: Lab, case: Case) -> Record:
@@ -253,11 +257,17 @@ def finetuned(lab: Lab, case: Case) -> Record:
     )
 
 
-def _trained(lab: Lab, case: Case, method: str, train: Callable[[SceneChange, Curve], HashField]) -> Record:
+def _trained(
+    lab: Lab,
+    case: Case,
+    method: str,
+    train: Callable[[SceneChange, Curve], HashField],
+    steps: int | None = None,
+) -> Record:
+    """``steps``: that the training will take; the usual number by default."""
     change = change_of(lab, case)
     lab.warm(case)
-    steps = lab.fit.steps * (LONGER if method == "retrained_long" else 1)
-    curve = Curve(_scorer(lab, case), looks_until(steps, lab.looks))
+    curve = Curve(_scorer(lab, case), looks_until(steps or lab.fit.steps, lab.looks))
     new = train(change, curve)
     last = curve.points[-1]
     record: Record = {"train": last.seconds, "steps": last.step, "curve": _plain(curve.points)}

@@ -18,7 +18,7 @@ from refield.scene.transforms_json import load_transforms
 from refield.vision.pixels import bounding_box
 from tables.cases import Case
 from tables.kept import Kept
-from tables.methods import LONGER, VIEWS
+from tables.methods import VIEWS
 from tables.show import Found
 
 COLUMNS = {
@@ -31,7 +31,7 @@ COLUMNS = {
     "lama_photo": "LaMa",
 }
 _INKS = {"ours": "#0f766e", "retrained": "#b45309", "retrained_long": "#d97706", "finetuned": "#7c3aed"}
-_LABELS = {"retrained_long": f"re-trained, {LONGER} times the steps"}
+_LABELS = {"retrained_long": "re-trained for longer"}
 _GAP, _CAPTION, _SIDE = 6, 20, 190
 
 

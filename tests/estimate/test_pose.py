@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from refield.estimate import recipe
 from refield.estimate.alone import object_alone
-from refield.estimate.associate import AssociateConfig, take_off, trimmed
+from refield.estimate.associate import AssociateConfig, is_sunk, take_off, trimmed
 from refield.estimate.conclude import _shown_in
 from refield.estimate.detail import detail_of
 from refield.estimate.explain import explained_before
@@ -198,6 +198,16 @@ def test_what_would_reach_into_the_ground_is_cut_off(stage):
     assert error(change.new_from_old)[0] < 0.6
     same, _ = trimmed(replace_planes(ground), sight, refine(sight, TRUE))
     assert (same.voxels & (z < 0)).any()  # without the ground nothing denies it
+
+
+def test_a_place_mostly_beneath_the_ground_is_told(stage):
+    ground = SimpleNamespace(planes=[Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)])
+    found = refine(Sight(BEFORE, stage.old, stage.past, [stage.old]), TRUE)
+    assert not is_sunk(ground, stage.old, found)
+    lower = found.new_from_old.clone()
+    lower[2, 3] -= 0.6 * float(stage.old.grid.tight_aabb().diff(dim=0)[0, 2])
+    assert is_sunk(ground, stage.old, replace(found, new_from_old=lower))
+    assert not is_sunk(replace_planes(ground), stage.old, replace(found, new_from_old=lower))
 
 
 def replace_planes(ground):

@@ -362,6 +362,8 @@ def best_fit(
     old, best = trimmed(ground, sight, best)
     least = believe.explains * min(1.0, max(0.5, shown_right(ground, old, past) / believe.shown))
     gains = believe.gains * (2 if best.before > believe.alike else 1)
+    if is_sunk(ground, old, best):  # possible, off the edge of a table; but a crumb of floor fits anywhere
+        least = max(least, ground.believe.shown)
     if best.explained < max(least, best.before + gains):
         return None
     return Fit(found[0].score, old, best)
@@ -381,6 +383,17 @@ def shown_right(ground: Ground, old: Old, past: Sequence[Past]) -> float:
     return explained_before([(v.photo, v.rgb, silhouette(v, old)) for v in ground.survey], threshold)
 
 
+def is_sunk(ground: Ground, old: Old, change: PoseChange) -> bool:
+    """Whether most of an object would be beneath what holds things up, at its new place."""
+    now = transform(change.new_from_old, torch.from_numpy(old.lattice.centres[old.voxels])).numpy()
+    return any((p.height(now) < -2 * _exact(old, p)).mean() > 0.5 for p in ground.planes)
+
+
+def _exact(old: Old, plane: Plane) -> float:
+    """How exact the height of an object's voxels above a plane is, world units."""
+    return max(0.25 * old.lattice.cell, plane.noise)
+
+
 def trimmed(ground: Ground, sight: Sight, change: PoseChange) -> tuple[Old, PoseChange]:
     """The object without what cannot be at its new place (§10.2.4 on new photos).
 
@@ -397,7 +410,7 @@ def trimmed(ground: Ground, sight: Sight, change: PoseChange) -> tuple[Old, Pose
     _, against = votes(now, seen, ground.carving)
     never = against > 0
     for plane in ground.planes:
-        height, least = plane.height(now), max(0.25 * old.lattice.cell, plane.noise)
+        height, least = plane.height(now), _exact(old, plane)
         if (height < -2 * least).mean() >= ground.believe.trim:  # more than a pose that is not exact
             never |= height < least
     if never.mean() < ground.believe.trim:

@@ -37,6 +37,7 @@ from refield.vision.pixels import dilate
 DEFAULTS = UpdateConfig()
 _PATCHES, _FOLDS, _SHADING_CELLS = 8, 4, 24  # an object's side in patches that are left out together; in cells
 _LIT_RAYS = 60_000  # of the new photos; a lattice of factors is no finer than they show
+_MADE = 20  # of the old photos that an earlier visit put out of date; each takes longer to put right than to learn from
 _RING_RAYS = 40_000  # of the old photos; more add time and nothing to learn
 
 
@@ -216,12 +217,13 @@ def _old_lessons(
     capture: Capture, cut: UpdatedField, region: OccupancySampler, config: UpdateConfig, light: Relighting | None
 ) -> tuple[Lessons, Tensor]:
     """Ring pixels of the old photos whose rays meet the region, in the new light, and the depth (N,) they show."""
-    bank, places = PixelBank(capture.train), places_of(cut.change)
+    asked = _asked(capture.train)
+    bank, places = PixelBank([capture.train[i] for i in asked]), places_of(cut.change)
     chosen = []
-    for i, frame in enumerate(capture.train):
-        ring = old_ring(places, i, frame, config.shadow, config.far)
+    for k, i in enumerate(asked):
+        ring = old_ring(places, i, capture.train[i], config.shadow, config.far)
         if ring is not None:
-            chosen.append(ring.reshape(-1).nonzero()[:, 0] + bank.starts[i])
+            chosen.append(ring.reshape(-1).nonzero()[:, 0] + bank.starts[k])
     pixels = torch.cat(chosen) if chosen else torch.zeros(0, dtype=torch.long)
     pixels = pixels[meets(region, bank.rays(pixels)).nonzero()[:, 0]]
     pixels = pixels[torch.randperm(len(pixels))[:_RING_RAYS]].sort().values
@@ -230,3 +232,10 @@ def _old_lessons(
     if light is not None:
         rgb = light.applied(rays.origins + rays.directions * was.depth[:, None], rgb)
     return Lessons(rays, rgb, torch.full((len(rgb),), -1)), was.depth
+
+
+def _asked(frames: Sequence[Frame]) -> list[int]:
+    """Indices of the old photos that teach: all of them, but only some of those that have yet to be made."""
+    made = [i for i, f in enumerate(frames) if f.made is None]
+    unmade = [i for i, f in enumerate(frames) if f.made is not None]
+    return sorted(made + unmade[:: max(1, len(unmade) // _MADE)])
