@@ -19,6 +19,7 @@ from torch import Tensor
 
 from refield.field.radiance import Field
 from refield.field.render import visible_samples
+from refield.field.sampling import STOP
 from refield.field.volrend import Samples, composite, weights
 from refield.field.warp import crossing, inside_box, outline
 from refield.scene.camera import Camera
@@ -31,6 +32,7 @@ Directed = Callable[[Tensor, Tensor], Tensor]
 """World points and directions (S, 3) -> the directions along which to ask for colours, (S, 3)."""
 
 _CHUNK = 8192
+_AT_ONCE = 12  # samples of a ray
 _NEGLIGIBLE = 1e-3  # weight of a sample whose colour is not asked for; the sum of what is lost stays below a grey level
 
 
@@ -96,13 +98,37 @@ def _see_all(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
 
 
 def _see(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
-    samples = visible_samples(field, rays) if hidden is None else field.sampler(rays)
-    x, d = samples.positions(rays)
     if hidden is None:
-        return shaded(field, (x, d), field.density(x), samples)
-    left = (~hidden(x)).nonzero()[:, 0]
-    sigmas = torch.zeros(len(x)).index_copy(0, left, field.density(x[left]))
-    return shaded(field, (x, d), sigmas, samples)
+        samples = visible_samples(field, rays)
+        at = samples.positions(rays)
+        return shaded(field, at, field.density(at[0]), samples)
+    samples, sigmas = _in_front(field, rays, hidden)
+    return shaded(field, samples.positions(rays), sigmas, samples)
+
+
+def _in_front(field: Field, rays: Rays, hidden: Hidden) -> tuple[Samples, Tensor]:
+    """Samples of rays and their densities without what is hidden, near to far, some at a time, until a ray has ended:
+    most of what a field holds lies behind its surfaces."""
+    every = field.sampler(rays)
+    first, count = every.ray_offsets[:-1], every.ray_offsets.diff()
+    sigmas, depth = torch.zeros(len(every.t_starts)), torch.zeros(len(rays))
+    asked = torch.zeros(len(sigmas), dtype=torch.bool)
+    ray, begin = (count > 0).nonzero()[:, 0], 0
+    while len(ray):
+        some = begin + torch.arange(_AT_ONCE)
+        there = some < count[ray, None]
+        rows, of = (first[ray, None] + some)[there], ray[:, None].expand(-1, _AT_ONCE)[there]
+        t0, t1 = every.t_starts[rows], every.t_ends[rows]
+        x = rays.origins[of] + rays.directions[of] * ((t0 + t1) / 2)[:, None]
+        left = (~hidden(x)).nonzero()[:, 0]
+        sigmas[rows[left]] = field.density(x[left])
+        asked[rows] = True
+        depth.index_add_(0, of, sigmas[rows] * (t1 - t0))
+        begin += _AT_ONCE
+        ray = ray[(count[ray] > begin) & (depth[ray] < STOP)]
+    kept = torch.bincount(every.ray_ids[asked], minlength=len(rays))
+    offsets = torch.cat([kept.new_zeros(1), kept.cumsum(0)])
+    return Samples(every.t_starts[asked], every.t_ends[asked], offsets), sigmas[asked]
 
 
 def shaded(
