@@ -11,6 +11,7 @@ from refield.scene.planes import Plane
 from refield.update.ground import Foothold, footholds, planes_around
 from refield.update.helper import emptiness
 from refield.update.region import Region, meets, move_out
+from refield.update.unseen import Sight
 
 EYES = torch.tensor([[1.0, 0, 1], [-1, 0, 1], [0, 1, 1], [0, -1, 1.2]])
 
@@ -81,13 +82,17 @@ def test_rays_enter_the_ground_where_the_object_stood_and_only_from_above():
     assert isinstance(foothold, Foothold) and foothold.holds(torch.tensor([[0.0, 0.0, -5.0]])).all()
 
 
-def test_what_was_looked_through_is_empty_and_what_was_hidden_is_not_known():
+def test_what_was_looked_through_is_empty_and_what_was_seen_beneath_the_floor_may_be_there():
     cells = move_out(SceneChange((box_at(0.0),)), 1.5).sampler(0.02)
-    possible = cells.grid.clone()
-    free = torch.tensor([[0.26, 0.0, 0.2]])
-    possible.view(-1)[cells.cells(free)] = 0
-    found = emptiness(SceneChange((box_at(0.0),)), cells, Region(()), (), replace(cells, grid=possible))
-    assert found[cells.cells(free)] == 1 and found[cells.cells(torch.tensor([[0.0, 0.0, -0.05]]))] == 0
+    planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]
+    x = torch.tensor([[0.26, 0.0, 0.2], [0.05, 0.05, -0.09], [-0.05, 0.05, -0.09]])
+    free, hidden, leg = cells.cells(x)
+    empty = replace(cells, grid=torch.zeros_like(cells.grid))
+    sight = Sight(empty, torch.stack([free, hidden, leg]), torch.tensor([3.0, -3.0, -1.0]))
+    found = emptiness(
+        SceneChange((box_at(0.0),)), cells, Region(()), footholds(SceneChange((box_at(0.0),)), planes), sight
+    )
+    assert found[free] == 1 and found[hidden] == 0.5 and found[leg] == 0
 
 
 def test_a_plane_that_it_did_not_touch_says_nothing():

@@ -40,9 +40,10 @@ def asked(field: Field, x: list[list[float]]) -> tuple[list[bool], list[bool]]:
 
 
 def test_what_lies_inside_is_hidden_and_what_was_looked_through_is_empty() -> None:
-    hidden, possible = asked(BallWorld((SHELL,), floor=False), [[0, 0, 0], [0.5, 0, 0], [0.7, 0, 0], [0, 0, 0.3]])
-    assert hidden == [True, False, False, True]
-    assert possible == [True, True, False, True]  # of what is inside nobody knows
+    points = [[0, 0, 0], [0.5, 0, 0], [0.7, 0, 0], [0, 0, 0.3], [0.6, 0.6, 0]]
+    hidden, possible = asked(BallWorld((SHELL,), floor=False), points)
+    assert hidden == [True, False, False, True, False]
+    assert possible == [True, True, False, True, False]  # of what is inside nobody knows
 
 
 def test_hidden_cells_are_not_shown_unless_something_new_answers_for_them() -> None:

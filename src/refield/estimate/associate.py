@@ -70,6 +70,8 @@ class AssociateConfig:
     """part of an object's voxels that the new photos or the ground deny, from which on it is trimmed"""
     core: float = 0.25
     """part of an object's voxels that must remain when it is trimmed"""
+    sunk: float = 0.8
+    """part of its pixels that must show an object which would be mostly beneath what holds things up"""
     still: float = 1.2
     """pixels; what moved by less stayed"""
     most: int = 5
@@ -363,7 +365,7 @@ def best_fit(
     least = believe.explains * min(1.0, max(0.5, shown_right(ground, old, past) / believe.shown))
     gains = believe.gains * (2 if best.before > believe.alike else 1)
     if is_sunk(ground, old, best):  # possible, off the edge of a table; but a crumb of floor fits anywhere
-        least = max(least, ground.believe.shown)
+        least = max(least, ground.believe.sunk)
     if best.explained < max(least, best.before + gains):
         return None
     return Fit(found[0].score, old, best)

@@ -14,7 +14,7 @@ from refield.field import kernels
 from refield.field.fit import NonFiniteError, TableAdam, rate_factor
 from refield.field.kernels.reference import Aim, Batch, Fixed, Unwanted
 from refield.field.radiance import HashField
-from refield.field.sampling import STOP, OccupancySampler
+from refield.field.sampling import STOP
 from refield.field.volrend import Samples, accumulate_rgb
 from refield.scene.capture import Rays
 from refield.update.composite import UpdatedField
@@ -24,6 +24,7 @@ from refield.update.ground import Foothold
 from refield.update.helper import HelperOccupancy, emptiness, without_directions
 from refield.update.region import Region
 from refield.update.supervision import Lessons
+from refield.update.unseen import Sight
 
 _CHUNK = 16384  # rays
 
@@ -64,15 +65,13 @@ class HelperTraining:
         judge: Lit,
         config: UpdateConfig,
         ground: Sequence[Foothold] = (),
-        possible: OccupancySampler | None = None,
+        sight: Sight | None = None,
     ) -> None:
         self.helper, self.config, self.frozen = helper, config, frozen
         self.taught, self.new_rays, self.judge = joined(sparse, old), len(sparse.lessons), judge
         added = tuple(o.grid for o in frozen.change.objects if o.kind == "added")
         taken = Region(added + frozen.bare.grids)
-        self.misplaced = config.emptiness * emptiness(
-            frozen.change, helper.sampler, taken, ground, frozen.pretrained.sampler
-        )
+        self.misplaced = config.emptiness * emptiness(frozen.change, helper.sampler, taken, ground, sight)
         self.occupancy = HelperOccupancy(helper)
         self.adam = TableAdam(helper)
         self.rays_per_step, self.steps_done = 1024, 0

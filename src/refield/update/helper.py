@@ -17,6 +17,7 @@ from refield.scene.capture import Frame
 from refield.scene.change import SceneChange
 from refield.update.ground import Foothold
 from refield.update.region import Region
+from refield.update.unseen import Sight
 
 _OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
 _WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
@@ -57,15 +58,15 @@ def emptiness(
     cells: OccupancySampler,
     taken: Region,
     ground: Sequence[Foothold] = (),
-    possible: OccupancySampler | None = None,
+    sight: Sight | None = None,
 ) -> Tensor:
     """How surely nothing is in each cell, (R**3,) float32: 0 where there may be something, 1 where nothing can be.
 
     What stood in the way of everything is not there any more: deep inside an object that left is nothing, and only
     near its surface may something else begin: the ground under it, the wall behind it. Where that is one of
     ``ground``, it is there, and the more so the nearer to it; what is above it near the object's surface is half as
-    empty, since a wall that the object leant on may not be among them. Where ``possible`` does not
-    look, nothing is. 0 in ``taken``, where something stands now.
+    empty, since a wall that the object leant on may not be among them. Where old photos looked
+    through (``sight``), nothing is. 0 in ``taken``, where something stands now.
     """
     r = cells.resolution
     depth = torch.zeros(r**3)
@@ -89,9 +90,11 @@ def emptiness(
         height, band = torch.from_numpy(foothold.plane.height(centres.numpy())), _band(foothold, cell)
         off = ((height.abs() - 2 * foothold.plane.noise) / band).clamp(0, 1)
         here = (height < band) & foothold.holds(centres)
+        if sight is not None:  # a table's legs are no mist
+            here &= (height > -band) | sight.dark.occupied(centres)
         depth[here] = torch.maximum(depth[here], _RIM * off[here])
-    if possible is not None:
-        depth[~possible.occupied(centres)] = 1.0
+    if sight is not None:
+        depth[~sight.possible.occupied(centres)] = 1.0
     return torch.where(taken.contains(centres), 0.0, depth) if taken.grids else depth
 
 

@@ -103,13 +103,13 @@ def update_field(
         return cut
     say("freeze")
     beside = [torch.stack([2 * b[0] - b[1], 2 * b[1] - b[0]]) for b in wide.boxes]
-    sight = sight_of(field, capture.train, beside)
+    sight = sight_of(cut.pretrained, capture.train, beside)
     frozen = lit(region=wide).unshown(sight.hidden)
     new_taught, judge = _split(Lit(sparse, _fixed(frozen, region, sparse.rays, ground)), config.held_out)
     old_taught = Lit(old, _fixed(frozen, region, old.rays, ground))
     say("train")
     helper = new_helper(region, change.frames, config.seed)
-    run = HelperTraining(helper, frozen, new_taught, old_taught, judge, config, ground, sight.possible)
+    run = HelperTraining(helper, frozen, new_taught, old_taught, judge, config, ground, sight)
     run.run(on_progress)
     say("show")
     helper.requires_grad_(False)
@@ -157,6 +157,7 @@ def _fixed(frozen: UpdatedField, region: OccupancySampler, rays: Rays, ground: S
 def _split(lit: Lit, every: int) -> tuple[Lit, Lit]:
     """What may be drawn, and every so-many-th ray to judge by."""
     index = torch.arange(len(lit.lessons))
+    every = max(every, 2)  # something has to be left to learn from
     kept = (index % every) == every // 2
     parts = [(~kept).nonzero()[:, 0], kept.nonzero()[:, 0]]
     taught, judge = (Lit(lit.lessons[p], lit.fixed[p]) for p in parts)
@@ -238,4 +239,4 @@ def _asked(frames: Sequence[Frame]) -> list[int]:
     """Indices of the old photos that teach: all of them, but only some of those that have yet to be made."""
     made = [i for i, f in enumerate(frames) if f.made is None]
     unmade = [i for i, f in enumerate(frames) if f.made is not None]
-    return sorted(made + unmade[:: max(1, len(unmade) // _MADE)])
+    return sorted(made + unmade[:: -(-len(unmade) // _MADE) or 1])

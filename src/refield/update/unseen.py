@@ -15,8 +15,8 @@ from refield.field.render import render_camera
 from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Frame
 
-_EYES = 24  # old photos asked, spread over all
-_SIDE = 40  # pixels of their longer side: a cell of the occupancy grid is wider than one of them
+_EYES = 24  # old photos asked at most, spread over all
+_SIDE = 56  # pixels of their longer side, each about as wide as a cell of the occupancy grid
 _BEHIND = 1.5  # cells; so far behind the surface a cell may still reach into what was seen
 _BEFORE = 0.5  # and from so far before it on it was looked through
 
@@ -39,6 +39,13 @@ class Sight:
         return self.cells[self.before < -_BEHIND]
 
     @property
+    def dark(self) -> OccupancySampler:
+        """Looks into the hidden cells alone."""
+        grid = torch.zeros_like(self.sampler.grid)
+        grid.view(-1)[self.hidden] = 1
+        return replace(self.sampler, grid=grid)
+
+    @property
     def possible(self) -> OccupancySampler:
         """Looks wherever something may be, for all that is known: not into empty cells that were looked through."""
         grid = torch.ones_like(self.sampler.grid)
@@ -54,7 +61,7 @@ def sight_of(field: Field, frames: Sequence[Frame], boxes: Sequence[Tensor]) -> 
     x = s.points_in(cells, jitter=False)
     side = 4 * s.contraction.radius / s.resolution * s.distance(cells).clamp_min(1) ** 2  # what is far is contracted
     before = torch.full((len(cells),), -torch.inf)
-    for frame in frames[:: max(1, len(frames) // _EYES)]:
+    for frame in frames[:: -(-len(frames) // _EYES) or 1]:
         camera = frame.camera.scaled(*_small(frame.camera.width, frame.camera.height))
         pose = frame.world_from_cam
         uv, z = camera.project((x - pose[:3, 3].float()) @ pose[:3, :3].float())
@@ -63,7 +70,8 @@ def sight_of(field: Field, frames: Sequence[Frame], boxes: Sequence[Tensor]) -> 
         if len(rows) == 0:
             continue
         j, i = uv[rows].long().unbind(-1)
-        depth = render_camera(field, camera, pose).depth[i, j]
+        seen = render_camera(field, camera, pose)
+        depth = torch.where(seen.opacity > 0.5, seen.depth, torch.inf)[i, j]  # nothing is in the way of nothing
         away = (x[rows] - frame.centre.float()).norm(dim=-1)
         before[rows] = torch.maximum(before[rows], (depth - away) / side[rows])
     return Sight(s, cells, before)

@@ -81,7 +81,7 @@ class Unwanted(NamedTuple):
     misplaced: Tensor
     """(R**3,) what a unit of weight in each cell adds to the loss"""
     taken: Callable[[Tensor], Tensor] | None
-    """World points (S, 3) -> (S,) bool: where it is not asked"""
+    """World points (S, 3) -> (S,) bool: where it is not asked. It must not march rays"""
 
 
 PRIMES = (1, 2654435761, 805459861)  # the spatial hash of Teschner et al. 2003, as in Instant-NGP, Eq. 4
@@ -402,7 +402,11 @@ def woven_step(
     counts = fixed.offsets.diff()[fixed.chosen]
     fixed_ids = torch.repeat_interleave(counts)
     before = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-    rows = torch.arange(len(fixed_ids)) - before[fixed_ids] + fixed.offsets[fixed.chosen][fixed_ids]
+    rows = (
+        torch.arange(len(fixed_ids), device=fixed_ids.device)
+        - before[fixed_ids]
+        + fixed.offsets[fixed.chosen][fixed_ids]
+    )
     t_mid, depth, shown = fixed.t_mid[rows], fixed.optical_depth[rows], fixed.rgb[rows]
     own, other = places_in_order(ids, mid, fixed_ids, t_mid)
     leaves = [p.detach().requires_grad_() for p in (tables, *networks)]
@@ -424,7 +428,8 @@ def woven_step(
         loss = loss + (w[own] * unwanted.misplaced[cells]).sum() / len(batch.colours)
     for into_one, grad in zip(into, torch.autograd.grad(loss, leaves)):
         into_one += grad
-    return Stepped(float(loss.detach()), cells, w[own].detach(), sigmas.detach(), len(both) - 1)
+    asked = t1 > t0
+    return Stepped(float(loss.detach()), cells[asked], w[own][asked].detach(), sigmas[asked].detach(), len(both) - 1)
 
 
 def places_in_order(ids: Tensor, t: Tensor, other_ids: Tensor, other_t: Tensor) -> tuple[Tensor, Tensor]:
@@ -433,8 +438,8 @@ def places_in_order(ids: Tensor, t: Tensor, other_ids: Tensor, other_t: Tensor) 
     Rays (int64) and distances of either; at the same distance the first set comes first.
     """
     a, b = order_key(ids, t), order_key(other_ids, other_t)
-    own = torch.arange(len(a)) + torch.searchsorted(b, a)
-    return own, torch.arange(len(b)) + torch.searchsorted(a, b, right=True)
+    own = torch.arange(len(a), device=a.device) + torch.searchsorted(b, a)
+    return own, torch.arange(len(b), device=a.device) + torch.searchsorted(a, b, right=True)
 
 
 def order_key(ray: Tensor, t: Tensor) -> Tensor:

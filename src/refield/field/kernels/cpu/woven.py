@@ -162,4 +162,9 @@ def woven_step(
     def through(*rest):  # type: ignore[no-untyped-def]
         _through(tuple(found), told, segments, array(fixed.chosen), wrong, *rest)
 
-    return scattered(found, cells, len(batch.colours), field, toward(aim, space, len(batch.colours)), into, through)
+    rays = len(batch.colours)
+    done = scattered(found, cells, rays, field, toward(aim, space, rays), into, through)
+    if unwanted.taken is None:
+        return done
+    asked = torch.from_numpy(found.t_ends > found.t_starts)
+    return Stepped(done.loss, cells[asked], done.weights[asked], done.sigmas[asked], rays)

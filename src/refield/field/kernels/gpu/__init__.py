@@ -19,7 +19,10 @@ from refield.field.kernels.gpu.networks import hash_density, hash_field
 from refield.field.kernels.gpu.optimiser import adam, adam_scale, descend, observe, scatter_max
 from refield.field.kernels.gpu.rays import accumulate, contract, distortion, ray_ids, spherical_harmonics, weights
 from refield.field.kernels.gpu.step import train_step
-from refield.field.kernels.reference import keep, woven_step  # elementwise; and a helper, which is trained on a CPU
+from refield.field.kernels.reference import (  # torch's own kernels do the one; nobody trains a helper on a GPU yet
+    keep,
+    woven_step,
+)
 
 __all__ = [
     "accumulate",
