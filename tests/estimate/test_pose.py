@@ -18,6 +18,7 @@ from refield.estimate.explain import explained_before
 from refield.estimate.faces import changed_parts
 from refield.estimate.hull import HullConfig
 from refield.estimate.layers import Sight, layers_at
+from refield.estimate.look import Hidden, see, shaded
 from refield.estimate.matched import camera_from_object, matched_poses
 from refield.estimate.models import Models
 from refield.estimate.past import changed_share, gone_score, look_past
@@ -25,7 +26,7 @@ from refield.estimate.pose_change import RefineConfig, refine, residuals
 from refield.estimate.register import Target, register, super_fibonacci, turns_about
 from refield.field.render import render_camera
 from refield.scene.camera import Camera
-from refield.scene.capture import camera_rays
+from refield.scene.capture import Rays, camera_rays
 from refield.scene.planes import Plane
 from refield.scene.pose import angle_between, invert, transform
 from refield.vision.matcher import SiftMatcher
@@ -198,6 +199,23 @@ def test_what_would_reach_into_the_ground_is_cut_off(stage):
     assert error(change.new_from_old)[0] < 0.6
     same, _ = trimmed(replace_planes(ground), sight, refine(sight, TRUE))
     assert (same.voxels & (z < 0)).any()  # without the ground nothing denies it
+
+
+def test_looking_past_what_is_hidden_is_as_if_whole_rays_were_asked(stage):
+    hidden = Hidden((stage.old.haze,))
+    rays = stage.past[0].view.rays[torch.arange(0, len(stage.past[0].view.rays), 7)]
+    up = Rays(rays.origins[:5], torch.tensor([0.0, 0.0, 1.0]).expand(5, 3).contiguous())
+    longest = 0
+    for some in (rays, up):
+        samples = BEFORE.sampler(some)
+        at = samples.positions(some)
+        truth = shaded(BEFORE, at, torch.where(hidden(at[0]), 0.0, BEFORE.density(at[0])), samples)
+        seen = see(BEFORE, some, hidden)
+        torch.testing.assert_close(seen.rgb, truth.rgb, rtol=0, atol=2e-3)
+        torch.testing.assert_close(seen.depth, truth.depth, rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(seen.opacity, truth.opacity, rtol=0, atol=2e-3)
+        longest = max(longest, int(samples.ray_offsets.diff().max()))
+    assert longest > 12 and not torch.equal(see(BEFORE, rays).rgb, see(BEFORE, rays, hidden).rgb)
 
 
 def test_a_place_mostly_beneath_the_ground_is_told(stage):

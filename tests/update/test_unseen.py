@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
-from refield.field.radiance import Field
+from refield.field.radiance import Field, HashField, HashFieldConfig
 from refield.scene.camera import Camera
-from refield.scene.capture import Frame
+from refield.scene.capture import Frame, Rays
 from refield.update.composite import UpdatedField
+from refield.update.config import UpdateConfig
+from refield.update.fit_helper import HelperTraining, Lit
+from refield.update.frozen import Segments
+from refield.update.region import move_out
+from refield.update.supervision import Lessons
 from refield.update.unseen import sight_of
 from tests.update.worlds import Ball, BallWorld, at, change_of, moved
 
@@ -55,3 +61,21 @@ def test_hidden_cells_are_not_shown_unless_something_new_answers_for_them() -> N
     assert updated.sampler.occupied(x).all()
     shown = updated.unshown(cells).sampler.occupied(x)
     assert shown.tolist() == [True, False] and updated.sampler.occupied(x).all()
+
+
+def test_a_helper_is_told_what_was_looked_through() -> None:
+    change = change_of(moved(SHELL, at(2.0, 0.0, 0.0)))
+    wide = move_out(change, 1.5)
+    frozen = UpdatedField(BallWorld((SHELL,), floor=False), change, region=wide)
+    helper = HashField(HashFieldConfig(2, 8, 16, 8, 8, 3), wide.sampler(0.05))
+    zeros = torch.zeros
+    rays = Rays(zeros(0, 3), zeros(0, 3))
+    nothing = Lit(
+        Lessons(rays, zeros(0, 3), zeros(0, dtype=torch.long)),
+        Segments(zeros(0), zeros(0), zeros(0, 3), zeros(1, dtype=torch.long)),
+    )
+    sight = sight_of(frozen.pretrained, frames(), [BOX])
+    x = torch.tensor([[0.7, 0.0, 0.0], [0.0, 0.0, 0.48]])  # beside the ball; at its surface
+    for known, tolls in ((sight, [UpdateConfig.emptiness, 0.0]), (None, [0.0, 0.0])):
+        run = HelperTraining(helper, frozen, nothing, nothing, nothing, UpdateConfig(), (), known)
+        assert run.misplaced[helper.sampler.cells(x)].tolist() == pytest.approx(tolls)
