@@ -31,6 +31,7 @@ COLUMNS = {
     "lama_photo": "LaMa",
 }
 _INKS = {"ours": "#0f766e", "retrained": "#b45309", "retrained_long": "#d97706", "finetuned": "#7c3aed"}
+_SECONDS = [t * 10**k for k in range(5) for t in (1, 2, 5)]  # where a logarithmic axis is labelled
 _LABELS = {"retrained_long": "re-trained for longer"}
 _GAP, _CAPTION, _SIDE = 6, 20, 190
 
@@ -111,7 +112,10 @@ def convergence(found: Found, world: str, path: Path) -> bool:
             if known:
                 axis.plot(*zip(*known), color=_INKS[method], marker=".", lw=1.2)
         axis.set(xscale="log", xlabel="seconds of training", title=title)
-        axis.grid(alpha=0.25, which="both", lw=0.5)
+        shown = [t for t in _SECONDS if axis.get_xlim()[0] <= t <= axis.get_xlim()[1]]
+        axis.set_xticks(shown, [str(t) for t in shown])
+        axis.set_xticks([], minor=True)
+        axis.grid(alpha=0.25, lw=0.5)
     for method in dict.fromkeys(m for m, _ in runs):
         axes[0].plot([], [], color=_INKS[method], label=_LABELS.get(method) or COLUMNS[method])
     axes[0].legend(frameon=False, loc="lower right", fontsize=8)
