@@ -9,7 +9,7 @@ from typing import Any
 
 from record import markdown
 
-from refield.baselines.curve import Point, time_to
+from refield.baselines.curve import Point, settled, time_to
 from tables import paper
 from tables.cases import Case
 from tables.kept import Kept, Record, spread
@@ -25,6 +25,8 @@ NAMES = {
     "inpainted_photo": "in-painted photo",
     "lama_photo": "in-painted photo, LaMa",
 }
+WINDOW = 8
+"""of so many parts of a training: the paper's 2500 steps are about an eighth of its re-training"""
 IN, OUT = paper.MEASURES[:3], paper.MEASURES[3:]
 
 
@@ -138,6 +140,29 @@ def catching_up(found: Found) -> str:
                     "ratio to our total": f"{least}{seconds / total:.2g}",
                     "our training s": train,
                     "ratio to our training": f"{least}{seconds / train:.2g}",
+                }
+            )
+    return markdown(rows)
+
+
+def converged(found: Found) -> str:
+    """When each training ended by its own rule, and when it had converged by the paper's."""
+    rows: list[Row] = []
+    for case in found.cases:
+        for method in ("ours", "retrained", "finetuned"):
+            record = found.kept.get(case.key, method)
+            if record is None or len(record.get("curve", [])) < 2:
+                continue
+            curve = [Point(p["step"], p["seconds"], p["scores"]) for p in record["curve"]]
+            theirs = settled(curve, max(curve[-1].step // WINDOW, 1))
+            rows.append(
+                {
+                    "world": case.key,
+                    "method": NAMES[method],
+                    "ended after steps": curve[-1].step,
+                    "s": curve[-1].seconds,
+                    "converged by the paper's rule after steps": None if theirs is None else theirs.step,
+                    "s ": None if theirs is None else theirs.seconds,
                 }
             )
     return markdown(rows)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from refield.baselines.curve import Curve, Point, looks_until, time_to
+from refield.baselines.curve import Curve, Point, looks_until, settled, time_to
 from refield.baselines.finetune import finetune
 from refield.baselines.material import material
 from refield.baselines.retrain import retrain
@@ -142,3 +142,17 @@ def test_when_a_score_was_reached() -> None:
     assert time_to(points, "psnr", 20.0) == 1.0 and time_to(points, "psnr", 21.0) == 3.0
     assert time_to(points, "psnr", 26.0) is None and time_to(points, "ssim", 0.1) is None
     assert looks_until(2000, 16)[-1] < 2000 and len(looks_until(2000, 16)) == 16 and min(looks_until(5, 16)) == 1
+
+
+def test_convergence_by_the_paper_s_rule() -> None:
+    def curve(*ssim: float | None) -> list[Point]:
+        return [Point(100 * k, 2.0 * k, {"ssim": v}) for k, v in enumerate(ssim)]
+
+    rising = curve(0.1, 0.5, 0.8, 0.9, 0.9003, 0.9004, 0.9004)
+    found = settled(rising, window=200)
+    assert found is not None and (found.step, found.seconds) == (300, 6.0)
+    assert settled(rising, window=400) is None  # nobody looked for so long
+    assert settled(curve(0.1, 0.5, 0.8, 0.9, 0.95), window=100) is None  # it rose to the end
+    late = settled(curve(0.5, 0.5, 0.9, 0.9), window=200)
+    assert late is None  # a pause is no end
+    assert settled(curve(None, None, None), window=100) is None

@@ -64,3 +64,16 @@ def looks_until(steps: int, count: int = 16) -> list[int]:
 def time_to(points: Sequence[Point], name: str, value: float) -> float | None:
     """Seconds of training until a score was first reached; None if it never was."""
     return next((p.seconds for p in points if (s := p.scores.get(name)) is not None and s >= value), None)
+
+
+def settled(points: Sequence[Point], window: int, gain: float = 5e-4) -> Point | None:
+    """The first look from which SSIM of whole views rises by less than ``gain`` until ``window`` steps have been taken.
+
+    The paper's rule of convergence (§11.3.2; its window is 2500 steps). None if the looks end before that is seen.
+    """
+    known = [(p, v) for p in points if (v := p.scores.get("ssim")) is not None]
+    for i, (point, value) in enumerate(known):
+        end = next((j for j, (p, _) in enumerate(known) if p.step >= point.step + window), None)
+        if end is not None and max(v for _, v in known[i + 1 : end + 1]) < value + gain:
+            return point
+    return None
