@@ -112,6 +112,10 @@ def _without_empty(rows: list[Row]) -> list[Row]:
 # --- derived ---
 
 
+def _curve(record: Record) -> list[Point]:
+    return [Point(p["step"], p["seconds"], p["scores"]) for p in record["curve"]]
+
+
 def catching_up(found: Found) -> str:
     """When re-training is first as good as the finished update, on the same photos."""
     rows: list[Row] = []
@@ -124,7 +128,7 @@ def catching_up(found: Found) -> str:
         total, train = first["total"] + ours["train"], ours["train"]
         for name in ("psnr_out", "psnr_in"):
             goal = ours["scores"]["as rendered"][name]
-            curve = [Point(p["step"], p["seconds"], p["scores"]) for p in again["curve"]]
+            curve = _curve(again)
             reached = None if goal is None else time_to(curve, name, goal)
             seconds, least = (reached, "") if reached is not None else (again["train"], "≥ ")
             rows.append(
@@ -153,7 +157,7 @@ def converged(found: Found) -> str:
             record = found.kept.get(case.key, method)
             if record is None or len(record.get("curve", [])) < 2:
                 continue
-            curve = [Point(p["step"], p["seconds"], p["scores"]) for p in record["curve"]]
+            curve = _curve(record)
             theirs = settled(curve, max(curve[-1].step // WINDOW, 1))
             rows.append(
                 {

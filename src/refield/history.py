@@ -90,7 +90,7 @@ def _differs(frame: Frame, before: Field, now: Field, changed: Sequence[Tensor])
     """
     camera = frame.camera
     part = min(max(1 / _COARSE, _LEAST / min(camera.width, camera.height)), 1.0)
-    coarse = camera.scaled(max(round(camera.width * part), 1), max(round(camera.height * part), 1))
+    coarse = camera.shrunk(part)
     rays = camera_rays(coarse, frame.world_from_cam)
     near = torch.stack([leaving(rays, box) for box in changed]).amax(0) > 0
     mask = torch.zeros(1, 1, coarse.height, coarse.width)

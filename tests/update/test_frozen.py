@@ -99,5 +99,5 @@ def test_nothing_is_left_beyond_a_distance() -> None:
     )
     near = fixed.before(torch.tensor([2.0, 9.0, torch.inf]))
     assert near.offsets.tolist() == [0, 1, 1, 3] and near.t_mid.tolist() == [1.0, 2.0, 5.0]
-    both = near.followed_by(fixed)
+    both = Segments.joined([near, fixed])
     assert both.offsets.tolist() == [0, 1, 1, 3, 5, 5, 7] and torch.equal(both[torch.tensor([3])].rgb, fixed.rgb[:2])

@@ -11,7 +11,6 @@ from refield.estimate.look import Seen, shaded
 from refield.estimate.objects import Old
 from refield.field.radiance import Field
 from refield.field.sampling import OccupancySampler
-from refield.field.volrend import Samples
 from refield.field.warp import crossing, outline
 from refield.scene.capture import Rays
 from refield.scene.pose import invert, rotate, transform
@@ -44,12 +43,9 @@ def object_alone(
         return Seen(rgb, depth, opacity)
     there = there[hit]
     samples = (sampler_around(field, old) if sampler is None else sampler)(there)
-    ids = samples.ray_ids
     x, d = samples.positions(there)
     keep = old.grid.contains(x).nonzero()[:, 0]
-    counts = torch.bincount(ids[keep], minlength=len(hit))
-    own = Samples(samples.t_starts[keep], samples.t_ends[keep], torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
     with torch.no_grad():
-        seen = shaded(field, (x[keep], d[keep]), field.density(x[keep]), own, old.outlook.held)
+        seen = shaded(field, (x[keep], d[keep]), field.density(x[keep]), samples.only(keep), old.outlook.held)
     rgb[hit], depth[hit], opacity[hit] = seen.rgb, seen.depth, seen.opacity
     return Seen(rgb, depth, opacity)

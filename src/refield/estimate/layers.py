@@ -220,7 +220,7 @@ def layers_at(sight: Sight, start: Tensor, rays: int) -> Layers:
         if full is None:
             continue
         c = p.view.frame.camera
-        camera = c if shrink == 1 else c.scaled(max(1, round(c.width * shrink)), max(1, round(c.height * shrink)))
+        camera = c if shrink == 1 else c.shrunk(shrink)
         box = box_in(camera, p.view.frame, corners, _MARGIN)
         if box is not None:
             crops.append(_crop(k, p, camera, box))

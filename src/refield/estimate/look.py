@@ -126,9 +126,7 @@ def _in_front(field: Field, rays: Rays, hidden: Hidden) -> tuple[Samples, Tensor
         depth.index_add_(0, of, sigmas[rows] * (t1 - t0))
         begin += _AT_ONCE
         ray = ray[(count[ray] > begin) & (depth[ray] < STOP)]
-    kept = torch.bincount(every.ray_ids[asked], minlength=len(rays))
-    offsets = torch.cat([kept.new_zeros(1), kept.cumsum(0)])
-    return Samples(every.t_starts[asked], every.t_ends[asked], offsets), sigmas[asked]
+    return every.only(asked), sigmas[asked]
 
 
 def shaded(
@@ -240,7 +238,7 @@ class View:
 def working_camera(camera: Camera, max_pixels: int) -> Camera:
     """The camera scaled down so that an image has at most ``max_pixels``."""
     shrink = min(1.0, (max_pixels / (camera.width * camera.height)) ** 0.5)
-    return camera.scaled(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
+    return camera.shrunk(shrink)
 
 
 def load_photo(frame: Frame, camera: Camera) -> Array:

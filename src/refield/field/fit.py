@@ -229,12 +229,6 @@ class TableAdam:
         self.left_out = 0
         """steps since the last that was taken"""
 
-    def backward(self, loss: Tensor) -> None:
-        """Add a loss' gradients, by autograd."""
-        for total, grad in zip(self.grads, torch.autograd.grad(loss, self.parameters, allow_unused=True)):
-            if grad is not None:
-                total += grad
-
     def step(self, rate: float, loss: float) -> bool:
         """Take the step if the loss and its gradients are finite; else leave it out, and count it.
 

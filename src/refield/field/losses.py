@@ -1,10 +1,9 @@
-"""What a field is fitted to: colour (Eq. 2) and the distortion loss of mip-NeRF 360; gradient scaling (§10.1)."""
+"""What a field is fitted to: colour (Eq. 2); gradient scaling (§10.1)."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
-from refield.field import kernels
 from refield.field.kernels.reference import scale_gradient
 from refield.field.volrend import Samples
 
@@ -12,12 +11,6 @@ from refield.field.volrend import Samples
 def colour_loss(rgb: Tensor, truth: Tensor) -> Tensor:
     """Eq. 2 as a mean: (N, 3), (N, 3) -> ()."""
     return (rgb - truth).square().mean()
-
-
-def distortion_loss(weights: Tensor, samples: Samples, radius: float) -> Tensor:
-    """Mean distortion of the rays; distances in s = t / (t + radius), so that far haze counts as near haze does."""
-    s0, s1 = (t / (t + radius) for t in (samples.t_starts, samples.t_ends))
-    return kernels.distortion(weights, s0, s1, samples.ray_offsets).mean()
 
 
 def scale_gradients(sigmas: Tensor, rgbs: Tensor, samples: Samples, unit: float) -> tuple[Tensor, Tensor]:

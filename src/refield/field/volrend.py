@@ -35,6 +35,11 @@ class Samples:
         counts = self.ray_offsets[1:] - self.ray_offsets[:-1]
         return torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
 
+    def only(self, which: Tensor) -> Samples:
+        """Some of them, of the same rays: rows in order, or (S,) bool."""
+        counts = torch.bincount(self.ray_ids[which], minlength=len(self.ray_offsets) - 1)
+        return Samples(self.t_starts[which], self.t_ends[which], torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
+
     def positions(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """World midpoints (S, 3) and directions (S, 3)."""
         ids = self.ray_ids

@@ -38,6 +38,10 @@ class Camera:
     def is_distorted(self) -> bool:
         return any((self.k1, self.k2, self.p1, self.p2, self.k3))
 
+    def shrunk(self, part: float) -> Camera:
+        """The same lens on a sensor of so many times as many pixels a side, one at least."""
+        return self.scaled(max(round(self.width * part), 1), max(round(self.height * part), 1))
+
     def scaled(self, width: int, height: int) -> Camera:
         """The same lens seen on a sensor resampled to ``width`` x ``height`` pixels."""
         sx, sy = width / self.width, height / self.height

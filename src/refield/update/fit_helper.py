@@ -48,11 +48,6 @@ class Lit:
     fixed: Segments
 
 
-def joined(a: Lit, b: Lit) -> Lit:
-    """The rays of both, ``a``'s first."""
-    return Lit(a.lessons.followed_by(b.lessons), a.fixed.followed_by(b.fixed))
-
-
 class HelperTraining:
     """One run: the helper between fixed segments, until held-out pixels stop gaining."""
 
@@ -68,7 +63,8 @@ class HelperTraining:
         sight: Sight | None = None,
     ) -> None:
         self.helper, self.config, self.frozen = helper, config, frozen
-        self.taught, self.new_rays, self.judge = joined(sparse, old), len(sparse.lessons), judge
+        lessons, fixed = sparse.lessons.followed_by(old.lessons), Segments.joined([sparse.fixed, old.fixed])
+        self.taught, self.new_rays, self.judge = Lit(lessons, fixed), len(sparse.lessons), judge
         added = tuple(o.grid for o in frozen.change.objects if o.kind == "added")
         taken = Region(added + frozen.bare.grids)
         self.misplaced = config.emptiness * emptiness(frozen.change, helper.sampler, taken, ground, sight)
@@ -142,11 +138,7 @@ class HelperTraining:
         """Without the samples inside what moved in (§10.1.2)."""
         x, _ = samples.positions(rays)
         taken = self._taken(x)
-        if not taken.any():
-            return samples
-        kept = torch.bincount(samples.ray_ids[~taken], minlength=len(rays))
-        offsets = torch.cat([kept.new_zeros(1), kept.cumsum(0)])
-        return Samples(samples.t_starts[~taken], samples.t_ends[~taken], offsets)
+        return samples.only(~taken) if taken.any() else samples
 
     def _taken(self, x: Tensor) -> Tensor:
         return self.frozen.arrived(x) >= 0

@@ -8,8 +8,8 @@ samples. Letters: N rays, K segments of all rays, ``offsets`` (N + 1,) their pre
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
 
 import torch
 from torch import Tensor
@@ -53,13 +53,14 @@ class Segments:
         offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
         return Segments(self.t_mid[kept], self.optical_depth[kept], self.rgb[kept], offsets)
 
-    def followed_by(self, more: Segments) -> Segments:
-        """Those of further rays behind them."""
-        counts = torch.cat([self.offsets.diff(), more.offsets.diff()])
+    @staticmethod
+    def joined(parts: Sequence[Segments]) -> Segments:
+        """Those of one set of rays after another's."""
+        counts = torch.cat([p.offsets.diff() for p in parts])
         return Segments(
-            torch.cat([self.t_mid, more.t_mid]),
-            torch.cat([self.optical_depth, more.optical_depth]),
-            torch.cat([self.rgb, more.rgb]),
+            torch.cat([p.t_mid for p in parts]),
+            torch.cat([p.optical_depth for p in parts]),
+            torch.cat([p.rgb for p in parts]),
             torch.cat([counts.new_zeros(1), counts.cumsum(0)]),
         )
 
@@ -76,7 +77,7 @@ def composite_once(field: Field, region: OccupancySampler, rays: Rays) -> Segmen
     """
     with torch.no_grad():
         parts = [_composite_chunk(field, region, rays[i : i + _CHUNK]) for i in range(0, max(len(rays), 1), _CHUNK)]
-    return reduce(Segments.followed_by, parts)
+    return Segments.joined(parts)
 
 
 def _composite_chunk(field: Field, region: OccupancySampler, rays: Rays) -> Segments:
@@ -114,8 +115,6 @@ class Woven:
     """(S + K, 3)"""
     t_mid: Tensor
     """(S + K,)"""
-    own: Tensor
-    """(S,) the places of the helper's samples"""
 
     @property
     def weights(self) -> Tensor:
@@ -139,5 +138,4 @@ def weave(fixed: Segments, samples: Samples, sigmas: Tensor, rgbs: Tensor) -> Wo
         mid.new_zeros(n).index_copy(0, own, tau).index_copy(0, other, fixed.optical_depth),
         mid.new_zeros(n, 3).index_copy(0, own, rgbs).index_copy(0, other, fixed.rgb),
         t_mid,
-        own,
     )

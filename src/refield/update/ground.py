@@ -17,7 +17,12 @@ from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.planes import Plane, rough_planes
 
 _POINTS = 6000  # that planes are looked for among
-_REACH = 0.12  # of an object's mean side: so near to a plane an object has to come to have stood on it
+_RIM = 0.12  # of an object's mean side
+
+
+def rim(grid: OccupancyGrid) -> float:
+    """How deep an object's rim is, world units: so near it came to what it stood on; what is deeper was all its own."""
+    return _RIM * float(grid.tight_aabb().diff(dim=0).mean())
 
 
 def footholds(change: SceneChange, planes: Sequence[Plane]) -> list[Foothold]:
@@ -27,7 +32,7 @@ def footholds(change: SceneChange, planes: Sequence[Plane]) -> list[Foothold]:
         occupied = o.grid.occupied().numpy()
         if o.kind == "added" or not len(occupied):
             continue
-        reach = _REACH * float(o.grid.tight_aabb().diff(dim=0).mean())
+        reach = rim(o.grid)
         touched = (p for p in planes if abs(float(np.quantile(p.height(occupied), 0.02))) < reach)
         found += [Foothold(p, o.grid, reach) for p in touched]
     return found

@@ -15,7 +15,7 @@ from refield.field.radiance import Field, HashField, HashFieldConfig
 from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Frame
 from refield.scene.change import SceneChange
-from refield.update.ground import Foothold
+from refield.update.ground import Foothold, rim
 from refield.update.region import Region
 from refield.update.unseen import Sight
 
@@ -23,7 +23,6 @@ _OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
 _WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
 _RIM = 0.5  # as empty as this is the rim of what stood on a plane, and everything beneath the plane
 _BAND = 2.5  # cells above and beneath what an object stood on over which it becomes so empty
-_DEPTH = 0.12  # of an object's mean side: so far inside, nothing that stood there can have been
 
 
 def new_helper(region: OccupancySampler, frames: tuple[Frame, ...], seed: int) -> HashField:
@@ -65,8 +64,8 @@ def emptiness(
     What stood in the way of everything is not there any more: deep inside an object that left is nothing, and only
     near its surface may something else begin: the ground under it, the wall behind it. Where that is one of
     ``ground``, it is there, and the more so the nearer to it; what is above it near the object's surface is half as
-    empty, since a wall that the object leant on may not be among them. Where old photos looked
-    through (``sight``), nothing is. 0 in ``taken``, where something stands now.
+    empty, since a wall that the object leant on may not be among them. Where old photos looked through (``sight``),
+    nothing is. 0 in ``taken``, where something stands now.
     """
     r = cells.resolution
     depth = torch.zeros(r**3)
@@ -78,20 +77,20 @@ def emptiness(
         inside = o.grid.contains(centres).reshape(r, r, r)
         if not inside.any():
             continue
-        box = o.grid.tight_aabb()
-        reach = float((box[1] - box[0]).mean()) * _DEPTH
+        reach = rim(o.grid)
         distance = torch.from_numpy(distance_transform_edt(inside.numpy())).float().reshape(-1) * cell
         depth = torch.maximum(depth, (distance / reach - 1).clamp(0, 1))
         above = [f.plane.height(centres.numpy()) > _band(f, cell) for f in ground if f.grid is o.grid]
         if above:
             free = inside.reshape(-1) & torch.from_numpy(np.logical_and.reduce(above))
             depth[free] = depth[free].clamp_min(_RIM)
+    dark = None if sight is None else sight.dark.occupied(centres)
     for foothold in ground:
         height, band = torch.from_numpy(foothold.plane.height(centres.numpy())), _band(foothold, cell)
         off = ((height.abs() - 2 * foothold.plane.noise) / band).clamp(0, 1)
         here = (height < band) & foothold.holds(centres)
-        if sight is not None:  # a table's legs are no mist
-            here &= (height > -band) | sight.dark.occupied(centres)
+        if dark is not None:  # a table's legs are no mist
+            here &= (height > -band) | dark
         depth[here] = torch.maximum(depth[here], _RIM * off[here])
     if sight is not None:
         depth[~sight.possible.occupied(centres)] = 1.0

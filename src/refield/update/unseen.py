@@ -62,7 +62,7 @@ def sight_of(field: Field, frames: Sequence[Frame], boxes: Sequence[Tensor]) -> 
     side = 4 * s.contraction.radius / s.resolution * s.distance(cells).clamp_min(1) ** 2  # what is far is contracted
     before = torch.full((len(cells),), -torch.inf)
     for frame in frames[:: -(-len(frames) // _EYES) or 1]:
-        camera = frame.camera.scaled(*_small(frame.camera.width, frame.camera.height))
+        camera = frame.camera.shrunk(min(_SIDE / max(frame.camera.width, frame.camera.height), 1.0))
         pose = frame.world_from_cam
         uv, z = camera.project((x - pose[:3, 3].float()) @ pose[:3, :3].float())
         inside = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
@@ -75,8 +75,3 @@ def sight_of(field: Field, frames: Sequence[Frame], boxes: Sequence[Tensor]) -> 
         away = (x[rows] - frame.centre.float()).norm(dim=-1)
         before[rows] = torch.maximum(before[rows], (depth - away) / side[rows])
     return Sight(s, cells, before)
-
-
-def _small(width: int, height: int) -> tuple[int, int]:
-    part = min(_SIDE / max(width, height), 1.0)
-    return max(round(part * width), 1), max(round(part * height), 1)

@@ -366,10 +366,14 @@ def train_step(
         loss = (rgb - batch.colours).square().mean() + aim.distortion * distortion(w, s0, s1, offsets).mean()
     for total, grad in zip(into, torch.autograd.grad(loss, leaves)):
         total += grad
-    r = grid.shape[0]
-    ijk = (unit * r).long().clamp_(0, r - 1)
-    cells = (ijk[:, 0] * r + ijk[:, 1]) * r + ijk[:, 2]
+    cells = _cells(unit, grid.shape[0])
     return Stepped(float(loss.detach()), cells, w.detach(), sigmas.detach(), len(offsets) - 1)
+
+
+def _cells(unit: Tensor, r: int) -> Tensor:
+    """Flat index (S,) of the cell of an r**3 grid that holds each position (S, 3) in [0, 1]."""
+    ijk = (unit * r).long().clamp_(0, r - 1)
+    return (ijk[:, 0] * r + ijk[:, 1]) * r + ijk[:, 2]
 
 
 def woven_step(
@@ -396,9 +400,7 @@ def woven_step(
     if unwanted.taken is not None:
         t1 = torch.where(unwanted.taken(x), t0, t1)
     unit = (contract(x, *space) + 2) / 4
-    r = grid.shape[0]
-    ijk = (unit * r).long().clamp_(0, r - 1)
-    cells = (ijk[:, 0] * r + ijk[:, 1]) * r + ijk[:, 2]
+    cells = _cells(unit, grid.shape[0])
     counts = fixed.offsets.diff()[fixed.chosen]
     fixed_ids = torch.repeat_interleave(counts)
     before = torch.cat([counts.new_zeros(1), counts.cumsum(0)])

@@ -95,6 +95,18 @@ def _along_ray(first, n, at, rgb, scratch, aim, told, w, sigma, to_raw, to_rgb):
 
 
 @njit(**JIT)
+def take_block(r, end, longest, directions, offsets, d):  # type: ignore[no-untyped-def]
+    """Ray ``r`` and those behind it up to ``longest`` samples: the first that no longer fits; directions go into d."""
+    first, last = offsets[r], r + 1
+    while last < end and offsets[last + 1] - first <= longest:
+        last += 1
+    for q in range(r, last):
+        for i in range(offsets[q] - first, offsets[q + 1] - first):
+            d[i, 0], d[i, 1], d[i, 2] = directions[q, 0], directions[q, 1], directions[q, 2]
+    return last
+
+
+@njit(**JIT)
 def _group(begin, end, found, batch, sizes, packed, aim, outs, sums):  # type: ignore[no-untyped-def]
     """Rays ``begin : end`` forward and back, some at a time; returns their share of the loss."""
     t0, t1, _, _, features, offsets = found
@@ -108,15 +120,9 @@ def _group(begin, end, found, batch, sizes, packed, aim, outs, sums):  # type: i
     to_raw, to_rgb = np.empty(longest, np.float32), np.empty((longest, 3), np.float32)
     loss, last = 0.0, begin
     while last < end:
-        r = last
-        first = offsets[r]
-        last += 1
-        while last < end and offsets[last + 1] - first <= longest:
-            last += 1
+        r, first = last, offsets[last]
+        last = take_block(r, end, longest, directions, offsets, d)
         n = offsets[last] - first
-        for q in range(r, last):
-            for i in range(offsets[q] - first, offsets[q + 1] - first):
-                d[i, 0], d[i, 1], d[i, 2] = directions[q, 0], directions[q, 1], directions[q, 2]
         forward_block(features[first : first + n], d[:n], sizes, packed, room)
         prepare(first, n, room[2][:, 0], t0, t1, aim[0], aim[2], sigma, scratch)
         for q in range(r, last):

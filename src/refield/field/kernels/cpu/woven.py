@@ -11,7 +11,7 @@ from refield.field.kernels.cpu.encoding import array
 from refield.field.kernels.cpu.marching import marched
 from refield.field.kernels.cpu.networks import BLOCK, backward_block, forward_block, room_for
 from refield.field.kernels.cpu.simd import JIT, exp
-from refield.field.kernels.cpu.step import find_cells, prepare, scattered, toward
+from refield.field.kernels.cpu.step import find_cells, prepare, scattered, take_block, toward
 from refield.field.kernels.reference import Aim, Batch, Fixed, Lattice, Networks, Space, Stepped, Unwanted
 
 _ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
@@ -104,15 +104,9 @@ def _group(begin, end, found, batch, fixed, chosen, wrong, sizes, packed, aim, o
     row = (np.empty((5, longest + most), np.float32), np.empty(longest + most, np.int64))
     loss, last = 0.0, begin
     while last < end:
-        r = last
-        first = offsets[r]
-        last += 1
-        while last < end and offsets[last + 1] - first <= longest:
-            last += 1
+        r, first = last, offsets[last]
+        last = take_block(r, end, longest, directions, offsets, d)
         n = offsets[last] - first
-        for q in range(r, last):
-            for i in range(offsets[q] - first, offsets[q + 1] - first):
-                d[i, 0], d[i, 1], d[i, 2] = directions[q, 0], directions[q, 1], directions[q, 2]
         forward_block(features[first : first + n], d[:n], sizes, packed, room)
         prepare(first, n, room[2][:, 0], t0, t1, aim[0], aim[2], sigma, scratch)
         for q in range(r, last):
