@@ -208,7 +208,8 @@ def test_visits_are_listed_and_taken_back(place, monkeypatch, capsys):
 
 def test_an_update_that_does_harm_is_not_kept(place, monkeypatch, capsys):
     believing(monkeypatch, "removed")
-    monkeypatch.setattr(update, "untouched_psnr", lambda *a: [30.0, 28.0])
+    values = iter((30.0, 28.0))
+    monkeypatch.setattr(update, "untouched_psnr", lambda *a: next(values))
     before = contents(place / "work")
     assert main(["update", "work", "new", *FEW]) == 2
     assert "2.0 dB worse and is not kept" in capsys.readouterr().err

@@ -43,6 +43,6 @@ def test_what_moved_is_known_where_it_is_now():
     assert known_objects(old) == []
     now = UpdatedField(old, SceneChange((ObjectChange("moved", grid, there),)))
     (known,) = known_objects(now)
-    assert torch.allclose(known.tight_aabb().mean(0), torch.tensor([1.0, 0.0, 0.0]), atol=0.05)
-    gone = UpdatedField(now, SceneChange((ObjectChange("removed", known),)))
+    assert torch.allclose(known.grid.tight_aabb().mean(0), torch.tensor([1.0, 0.0, 0.0]), atol=0.05)
+    gone = UpdatedField(now, SceneChange((ObjectChange("removed", known.grid),)))
     assert known_objects(gone) == []

@@ -5,21 +5,24 @@ Every visit that changed something wraps the field before it; an updated field i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from refield.artefacts import TENSORS
 from refield.field.radiance import Field
 from refield.field.render import render_many
+from refield.field.source import Known
+from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change import OccupancyGrid
-from refield.scene.images import frame_image, write_image
-from refield.update.composite import UpdatedField, layers_of, leaving
+from refield.scene.images import frame_image, scaled_image, write_image
+from refield.update.composite import UpdatedField, layers_of, leaving, source_of
 from refield.update.store import load_updated
 from refield.workspace import Workspace
 
@@ -45,11 +48,16 @@ def state(workspace: Workspace, visit: int) -> Field:
     return field
 
 
-def known_objects(now: Field) -> list[OccupancyGrid]:
+def known_objects(now: Field) -> list[Known]:
     """What the visits that led to a field found out about things that can move, and where each stands in it."""
+    return [Known(grid, source_of(now, grid)) for grid in _grids_now(now)]
+
+
+def _grids_now(now: Field) -> list[OccupancyGrid]:
+    """Of all objects that visits found, where they are."""
     if not isinstance(now, UpdatedField):
         return []
-    known = known_objects(now.pretrained)
+    known = _grids_now(now.pretrained)
     for o in now.change.objects:
         centre = o.grid.tight_aabb().mean(0)
         known = [k for k in known if not bool(k.contains(centre))]
@@ -69,35 +77,47 @@ def retouched(capture: Capture, before: Field, now: Field, folder: Path) -> Capt
         return capture
 
     def one(frame: Frame, name: str) -> Frame:
-        return replace(frame, path=folder / name, made=partial(_retouch, frame, (before, now), changed))
+        return replace(frame, path=folder / name, made=_Retouched(frame, (before, now), changed))
 
     return replace(capture, frames=tuple(one(f, f"{i:04d}.png") for i, f in enumerate(capture.frames)))
 
 
-def _retouch(frame: Frame, states: tuple[Field, Field], changed: Sequence[Tensor], path: Path) -> None:
-    image = frame_image(frame).float() / 255
-    mask = _differs(frame, *states, changed)
-    if mask.any():
-        rays = camera_rays(frame.camera, frame.world_from_cam)
-        image[mask] = render_many(states[1], rays[mask.reshape(-1)]).rgb
-    write_image(path, image)
+@dataclass(frozen=True)
+class _Retouched:
+    """See `retouched`."""
 
+    frame: Frame
+    """as photographed"""
+    states: tuple[Field, Field]
+    """then and now"""
+    changed: Sequence[Tensor]
+    """world boxes (2, 3); only rays through them are compared"""
 
-def _differs(frame: Frame, before: Field, now: Field, changed: Sequence[Tensor]) -> Tensor:
-    """(H, W) bool: where two states look different from a frame, with a margin of a coarse pixel.
+    def __call__(self, path: Path) -> None:
+        frame = self.frame
+        image = frame_image(frame).float() / 255
+        part = min(max(1 / _COARSE, _LEAST / min(frame.camera.width, frame.camera.height)), 1.0)
+        coarse = self._differs(frame.camera.shrunk(part))
+        mask = functional.interpolate(coarse[None, None], image.shape[:2])[0, 0] > 0.5
+        if mask.any():
+            rays = camera_rays(frame.camera, frame.world_from_cam)
+            image[mask] = render_many(self.states[1], rays[mask.reshape(-1)]).rgb
+        write_image(path, image)
 
-    ``changed`` are world boxes (2, 3); only rays through them are compared.
-    """
-    camera = frame.camera
-    part = min(max(1 / _COARSE, _LEAST / min(camera.width, camera.height)), 1.0)
-    coarse = camera.shrunk(part)
-    rays = camera_rays(coarse, frame.world_from_cam)
-    near = torch.stack([leaving(rays, box) for box in changed]).amax(0) > 0
-    mask = torch.zeros(1, 1, coarse.height, coarse.width)
-    shown = [render_many(f, rays[near]).rgb for f in (before, now)]
-    mask.view(-1)[near] = ((shown[0] - shown[1]).abs().amax(-1) > _SHOWS).float()
-    mask = torch.nn.functional.max_pool2d(mask, 3, stride=1, padding=1)
-    return torch.nn.functional.interpolate(mask, (camera.height, camera.width))[0, 0] > 0.5
+    def at(self, camera: Camera, now: Tensor) -> Tensor:
+        """See `Made`."""
+        image = scaled_image(self.frame, camera)
+        return torch.where(self._differs(camera, now)[..., None] > 0.5, now, image)
+
+    def _differs(self, camera: Camera, now: Tensor | None = None) -> Tensor:
+        """(H, W) float32, 1 where the two states look different from the frame's place, with a margin of a pixel."""
+        rays = camera_rays(camera, self.frame.world_from_cam)
+        near = torch.stack([leaving(rays, box) for box in self.changed]).amax(0) > 0
+        was, now = render_many(self.states[0], rays[near]).rgb, None if now is None else now.reshape(-1, 3)[near]
+        now = render_many(self.states[1], rays[near]).rgb if now is None else now
+        mask = torch.zeros(1, 1, camera.height, camera.width)
+        mask.view(-1)[near] = ((was - now).abs().amax(-1) > _SHOWS).float()
+        return functional.max_pool2d(mask, 3, stride=1, padding=1)[0, 0]
 
 
 def _changed_boxes(now: Field) -> list[Tensor]:
@@ -108,14 +128,11 @@ def _changed_boxes(now: Field) -> list[Tensor]:
     return boxes
 
 
-def untouched_psnr(fields: Sequence[Field], frames: Sequence[Frame], masks: Sequence[Tensor]) -> list[float]:
-    """PSNR (dB) of each field over the pixels of ``frames`` that are in no mask, all frames pooled."""
-    errors, count = [0.0] * len(fields), 0
-    for frame, mask in zip(frames, masks):
-        truth = frame_image(frame).reshape(-1, 3).float() / 255
-        chosen = (~mask.reshape(-1)).nonzero()[:, 0]
-        rays = camera_rays(frame.camera, frame.world_from_cam)[chosen]
-        count += 3 * len(chosen)
-        for k, field in enumerate(fields):
-            errors[k] += float((render_many(field, rays).rgb - truth[chosen]).square().sum())
-    return [float(-10 * torch.log10(torch.tensor(max(e / max(count, 1), 1e-12)))) for e in errors]
+def untouched_psnr(shown: Sequence[Tensor], frames: Sequence[Frame], masks: Sequence[Tensor]) -> float:
+    """PSNR (dB) of pictures (H, W, 3) over the pixels of ``frames`` that are in no mask, all frames pooled."""
+    error, count = 0.0, 0
+    for picture, frame, mask in zip(shown, frames, masks):
+        truth = frame_image(frame)[~mask].float() / 255
+        error += float((picture[~mask] - truth).square().sum())
+        count += truth.numel()
+    return -10 * math.log10(max(error / max(count, 1), 1e-12))

@@ -12,9 +12,8 @@ from refield.estimate.lattice import Lattice, grown
 from refield.estimate.look import View
 from refield.estimate.objects import Patch
 from refield.estimate.outline import carve_solid
-from refield.estimate.segment import meets
 from refield.scene.camera import Camera
-from refield.scene.capture import Frame
+from refield.scene.capture import Frame, Rays
 from refield.scene.change import OccupancyGrid
 from tests.estimate.boxes import camera_at
 
@@ -159,7 +158,7 @@ def test_rays_that_meet_a_shape(rng):
     t = near[:, None] + (far - near)[:, None] * (torch.arange(40) + 0.5) / 40
     expected = (far > near) & grid.contains(o[:, None] + d[:, None] * t[..., None]).any(1)
     assert 0.1 < expected.float().mean() < 0.9
-    assert torch.equal(meets(grid, origins, directions), expected)
+    assert torch.equal(grid.met_by(Rays(origins, directions)), expected)
 
 
 @pytest.mark.parametrize("steps", [-1, 0, 1, 2, 5, 30])

@@ -5,6 +5,7 @@ import torch
 
 from refield.estimate.models import Models
 from refield.estimate.recipe import EstimateConfig, estimate_change
+from refield.field.source import Known
 from refield.scene.errors import InputError
 from refield.scene.images import frame_image, write_image
 from refield.scene.pose import angle_between, transform
@@ -106,7 +107,9 @@ def test_an_object_that_an_earlier_visit_found_is_not_segmented_again(old, tmp_p
             return super().masks(image, boxes, hint)
 
     models = Models(segmenter=Asked())
-    (again,) = estimate_change(old, BEFORE, photos, EstimateConfig(survey=6), models=models, known=[first.grid]).objects
+    (again,) = estimate_change(
+        old, BEFORE, photos, EstimateConfig(survey=6), models=models, known=[Known(first.grid)]
+    ).objects
     assert again.kind == "moved" and len(asked) <= len(photos)
     assert float(angle_between(again.new_from_old, true)) < 0.7
     inside = overlap(again.grid, CRATE)[1]

@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from refield.field.warp import Move, Outlook, move_in, outline, two_way
+from refield.field.outlook import Outlook
+from refield.field.warp import Move, move_in, outline, two_way
 from refield.scene import pose
 from refield.scene.change import OccupancyGrid
 
@@ -132,3 +133,12 @@ def test_each_side_is_asked_from_where_it_was_seen() -> None:
     assert float(held[0, 0]) < 0 and torch.allclose(held.norm(dim=-1), torch.ones(1))
     from_below = torch.tensor([[0.0, 0.0, 1.0]])
     assert abs(float(outlook.held(east, from_below)[0, 2])) <= math.sin(outlook.reach) + 1e-5
+
+
+def test_the_compiled_search_of_directions_says_what_plain_torch_does() -> None:
+    torch.manual_seed(0)
+    eyes = 3 * torch.nn.functional.normalize(torch.randn(40, 3), dim=-1)
+    outlook = Outlook.from_eyes(eyes, ball((0.0, 0.0, 0.0), 0.5))
+    x, d = torch.randn(5000, 3) / 3, torch.nn.functional.normalize(torch.randn(5000, 3), dim=-1)
+    for found, expected in zip(outlook.nearest(x, d), outlook.nearest_plainly(x, d)):
+        assert torch.allclose(found, expected, atol=1e-6)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+
+from torch import Tensor
 
 from refield.commands.clock import Clock
 from refield.evaluate import Report
-from refield.field.radiance import Field
-from refield.field.render import render_frame
 from refield.report import Comparison, VisitReport
 from refield.scene.change import SceneChange
 from refield.scene.images import frame_image
@@ -16,16 +16,17 @@ from refield.scene.images import frame_image
 def page(
     title: str,
     change: SceneChange,
-    fields: tuple[Field, Field | None],
+    shown: tuple[Sequence[Tensor], Sequence[Tensor] | None],
     clock: Clock,
     evaluation: Report | None,
     facts: Mapping[str, float | str],
 ) -> VisitReport:
-    """``fields`` are the old one and the updated one (None if nothing changed)."""
+    """``shown`` are the pictures (H, W, 3) that the old field and the updated one (None if nothing changed) have of
+    the used new photos."""
     return VisitReport(
         title,
         change,
-        photos=_photos(change, *fields),
+        photos=_photos(change, *shown),
         seconds=dict(clock.seconds),
         evaluation=None if evaluation is None else evaluation.to_dict(),
         evaluation_views=() if evaluation is None else evaluation_views(evaluation),
@@ -49,7 +50,7 @@ def evaluation_views(evaluation: Report) -> tuple[Comparison, ...]:
     )
 
 
-def _photos(change: SceneChange, old: Field, new: Field | None) -> tuple[Comparison, ...]:
+def _photos(change: SceneChange, before: Sequence[Tensor], after: Sequence[Tensor] | None) -> tuple[Comparison, ...]:
     out, used = [], 0
     for photo in change.photos:
         frame = photo.frame
@@ -60,8 +61,8 @@ def _photos(change: SceneChange, old: Field, new: Field | None) -> tuple[Compari
             Comparison(
                 name=photo.name,
                 photo=frame_image(frame),
-                before=render_frame(old, frame).rgb,
-                after=None if new is None else render_frame(new, frame).rgb,
+                before=before[used],
+                after=None if after is None else after[used],
                 mask_in=change.masks_in[used] if change.masks_in else None,
                 mask_out=change.masks_out[used] if change.masks_out else None,
                 unclear=change.unexplained[used] if change.unexplained else None,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
+from torch import Tensor
 from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
@@ -17,6 +18,7 @@ from refield.estimate.localize import LocalizeConfig
 from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.evaluate import Report, evaluate
 from refield.field.radiance import Field
+from refield.field.render import render_frame
 from refield.history import changed_visits, known_objects, retouched, state, untouched_psnr
 from refield.photos.taken import PhotoConfig
 from refield.report import summary, write_report
@@ -103,7 +105,11 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         ).among(placed)
         _need_a_photo(options.photos, change)
         new = _updated(capture, old, change, options.update, clock)
-        clock.stage("report")
+        clock.stage("judge the update" if new else "report")
+        before, after = _shown(old, change), None if new is None else _shown(new, change)
+        if after is not None:
+            _need_no_harm(change, before, after)
+            clock.stage("report")
         evaluation = None
         if options.evaluation is not None:
             evaluation = evaluate(new or old, options.evaluation, old=old if new else None)
@@ -113,7 +119,7 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
                 save_updated(folder, new)
             clock.stop()
             title = f"{options.work.resolve().name}, visit {number + 1}"
-            report = page(title, change, (old, new), clock, evaluation, facts or {})
+            report = page(title, change, (before, after), clock, evaluation, facts or {})
             write_report(folder, replace(report, world=workspace.world()))
     return Visit(workspace.visit(number + 1), change, evaluation)
 
@@ -134,19 +140,24 @@ def _need_a_photo(photos: Path, change: SceneChange) -> None:
 def _updated(
     capture: Capture, old: Field, change: SceneChange, config: UpdateConfig, clock: Clock
 ) -> UpdatedField | None:
-    """The updated field, None if nothing changed.
-
-    Raises:
-        InputError: it would show the unchanged pixels of the new photos worse than the old field does.
-    """
+    """The updated field, None if nothing changed."""
     if not change.objects:
         return None
     with clock.training("update") as line:
-        new = update_field(capture, old, change, config, on_stage=clock.stage, on_progress=line)
-    clock.stage("judge the update")
+        return update_field(capture, old, change, config, on_stage=clock.stage, on_progress=line)
+
+
+def _shown(field: Field, change: SceneChange) -> list[Tensor]:
+    """What a field shows from where each used new photo was taken, (H, W, 3) each."""
+    return [render_frame(field, frame).rgb for frame in change.frames]
+
+
+def _need_no_harm(change: SceneChange, before: Sequence[Tensor], after: Sequence[Tensor]) -> None:
+    """Raises:
+    InputError: the update shows the unchanged pixels of the new photos worse than the old field does.
+    """
     masks = [a | b for a, b in zip(change.masks_in, change.masks_out)]
-    before, after = untouched_psnr([old, new], change.frames, masks)
-    if after < before - MOST_LOST:
-        what = f"the update would make unchanged pixels {before - after:.1f} dB worse and is not kept"
+    was, now = (untouched_psnr(shown, change.frames, masks) for shown in (before, after))
+    if now < was - MOST_LOST:
+        what = f"the update would make unchanged pixels {was - now:.1f} dB worse and is not kept"
         raise InputError("update", what, "check the new photos' poses and light, or give more photos")
-    return new

@@ -17,10 +17,10 @@ from refield.scene.pose import invert, rotate, transform
 
 
 def sampler_around(field: Field, old: Old) -> OccupancySampler:
-    """The field's own sampler, which no longer looks anywhere but around the object's old place."""
-    sampler = field.sampler
+    """The sampler of the field that an object is looked up in, which no longer looks anywhere but around it."""
+    sampler = (old.source or field).sampler
     only = torch.zeros_like(sampler.grid)
-    cells = sampler.cells_in(outline(old.grid))
+    cells = sampler.cells_in(outline(old.home[0]))
     only.view(-1)[cells] = sampler.grid.reshape(-1)[cells]
     return replace(sampler, grid=only)
 
@@ -33,19 +33,26 @@ def object_alone(
     The samples are where the field's own sampler has them: a field is only right at the spacing it was trained with.
     Its colours are asked along directions that old photos looked along. ``sampler``: of `sampler_around`, if known.
     """
-    old_from_new = invert(new_from_old)
-    there = Rays(transform(old_from_new, rays.origins), rotate(old_from_new, rays.directions))
+    grid, old_from_home = old.home
+    home_from_new = invert(new_from_old @ old_from_home)
+    there = Rays(transform(home_from_new, rays.origins), rotate(home_from_new, rays.directions))
     n = len(rays)
     rgb, depth, opacity = torch.zeros(n, 3), torch.full((n,), torch.inf), torch.zeros(n)
-    near, far = crossing(there, outline(old.grid))
+    near, far = crossing(there, outline(grid))
     hit = (far > near).nonzero()[:, 0]
     if len(hit) == 0:
         return Seen(rgb, depth, opacity)
     there = there[hit]
-    samples = (sampler_around(field, old) if sampler is None else sampler)(there)
+    sampler = sampler_around(field, old) if sampler is None else sampler
+    end = float(far[hit].max()) / sampler.contraction.radius  # beyond it there is nothing to look for
+    samples = replace(sampler, far=min(end, sampler.far))(there)
     x, d = samples.positions(there)
-    keep = old.grid.contains(x).nonzero()[:, 0]
+    keep = grid.contains(x).nonzero()[:, 0]
+    at, left = (x[keep], d[keep]), samples.only(keep)
     with torch.no_grad():
-        seen = shaded(field, (x[keep], d[keep]), field.density(x[keep]), samples.only(keep), old.outlook.held)
+        if old.source is None:
+            seen = shaded(field, at, field.density(at[0]), left, old.outlook.held)
+        else:
+            seen = shaded(old.source, at, old.source.density(at[0]), left)
     rgb[hit], depth[hit], opacity[hit] = seen.rgb, seen.depth, seen.opacity
     return Seen(rgb, depth, opacity)

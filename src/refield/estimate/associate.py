@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -183,16 +184,16 @@ def _place_all(
     """Place the old objects that fit somewhere, the best first, taking each off the photos."""
     moved: dict[int, PoseChange] = {}
     tried = list(olds.items())[: ground.believe.most]
-    guesses = {k: matched_poses(old, views, ground.survey, ground.matcher) for k, old in tried}
-    everyone = list(olds.values())
+    everyone, asked = list(olds.values()), views
+    guess = cache(lambda k: matched_poses(olds[k], asked, ground.survey, ground.matcher))
     while True:
         parts = newcomers(ground, arrivals(ground, views, everyone), views)[: ground.believe.most]
-        tries = {
-            k: best_fit(ground, olds[k], everyone, views, parts, extra)
-            for k, extra in guesses.items()
-            if k not in moved and parts
-        }
-        fits = {k: fit for k, fit in tries.items() if fit is not None}
+        fits: dict[int, Fit] = {}
+        # what moved before moves again: a piece of something else is tried only on what that leaves unexplained
+        for again in (True, False):
+            some = [k for k, old in tried if old.remembered == again and k not in moved and parts and not fits]
+            tries = {k: best_fit(ground, olds[k], everyone, views, parts, guess(k)) for k in some}
+            fits |= {k: fit for k, fit in tries.items() if fit is not None}
         if not fits:
             return moved, views, olds
         for k in _together(fits, ground.search.enough):

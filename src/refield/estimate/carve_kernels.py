@@ -1,4 +1,4 @@
-"""The hot loops of carving: points against views, rays against a shape, voxels against their neighbours (numba).
+"""The hot loops of carving: points against views, voxels against their neighbours (numba).
 
 Letters: N points (N, 3) in the world, V windows, P pixels of all windows together. A window is a rectangle of a view
 and how far away the old field's surface is in it, known by 26 numbers: cam_from_world R (9) and t (3), fx fy cx cy,
@@ -138,54 +138,6 @@ def find_solid(
                 if passed > allowed:
                     break
         out[n] = passed <= allowed and least < deepest
-
-
-@njit(**_JIT)
-def _cell(x: float, low: float, high: float, nodes: int) -> tuple[int, float]:
-    """Along one axis: the node below a place, and the part of the way to the next; node -1 outside."""
-    at = (x - low) / (high - low) * (nodes - 1)
-    if not (at >= 0 and at <= nodes - 1):
-        return -1, 0.0
-    node = min(int(at), nodes - 2)
-    return node, at - node
-
-
-@njit(**_JIT)
-def _inside(values: _F32, box: _F64, x: float, y: float, z: float) -> bool:
-    """Whether the trilinear value at a place is above one half, as `OccupancyGrid.contains`."""
-    i, a = _cell(x, box[0, 0], box[1, 0], values.shape[0])
-    j, b = _cell(y, box[0, 1], box[1, 1], values.shape[1])
-    k, c = _cell(z, box[0, 2], box[1, 2], values.shape[2])
-    if i < 0 or j < 0 or k < 0:
-        return False
-    value = 0.0
-    for p in range(2):
-        for q in range(2):
-            part = (a if p else 1 - a) * (b if q else 1 - b)
-            value += part * (values[i + p, j + q, k] * (1 - c) + values[i + p, j + q, k + 1] * c)
-    return value > 0.5
-
-
-@njit(parallel=True, **_JIT)
-def find_hits(origins: _F32, directions: _F32, values: _F32, box: _F64, tight: _F64, steps: int, out: _Bool) -> None:
-    """``out`` (N,): whether rays pass through a grid's inside at one of ``steps`` places along their way through the
-    box ``tight`` (2, 3). values (X, Y, Z), whose corner nodes are at the corners of ``box`` (2, 3)."""
-    for n in prange(len(origins)):
-        near, far = 0.0, np.inf
-        for axis in range(3):
-            along = float(directions[n, axis])
-            along = along if abs(along) >= 1e-9 else 1e-9
-            first, last = (tight[0, axis] - origins[n, axis]) / along, (tight[1, axis] - origins[n, axis]) / along
-            near, far = max(near, min(first, last)), min(far, max(first, last))
-        if not far > near:
-            continue
-        for step in range(steps):
-            t = near + (far - near) * (step + 0.5) / steps
-            x = origins[n, 0] + directions[n, 0] * t
-            y = origins[n, 1] + directions[n, 1] * t
-            if _inside(values, box, x, y, origins[n, 2] + directions[n, 2] * t):
-                out[n] = True
-                break
 
 
 @njit(parallel=True, **_JIT)

@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from refield.estimate.look import Array, View, load_photo
+from refield.estimate.look import Array, View
 from refield.estimate.objects import Old, Patch, box_in, corners_of, look_around
 from refield.field.radiance import Field
 from refield.scene.capture import Frame
+from refield.scene.images import scaled_image
 from refield.scene.pose import invert, transform
 
 _SAME = 2.0  # pixels' widths; what lies this close to the surface that an old photo shows is on it
@@ -88,5 +89,5 @@ def detail_of(
 def _missing(patch: Patch) -> Array:
     """The photo less the field's picture, but for what its whole exposure explains."""
     x0, y0, x1, y1 = patch.box
-    left = load_photo(patch.frame, patch.camera)[y0:y1, x0:x1] - patch.rgb
+    left = scaled_image(patch.frame, patch.camera).numpy()[y0:y1, x0:x1] - patch.rgb
     return np.ascontiguousarray(left - np.median(left.reshape(-1, 3), axis=0), np.float32)

@@ -19,13 +19,14 @@ from torch import Tensor
 from refield.estimate.alone import object_alone, sampler_around
 from refield.estimate.detail import Detail
 from refield.estimate.explain import Compared
-from refield.estimate.look import Hidden, Seen, load_photo, pixel_slopes, see
+from refield.estimate.look import Hidden, Seen, pixel_slopes, see
 from refield.estimate.objects import Old, box_in, patch_rays
 from refield.estimate.past import Past
 from refield.field.radiance import Field
 from refield.field.sampling import OccupancySampler
 from refield.scene.camera import Camera
 from refield.scene.capture import Rays
+from refield.scene.images import scaled_image
 from refield.scene.pose import exp, invert, rigid, skew, transform
 
 _MARGIN = 5  # pixels around the object that are compared too
@@ -231,7 +232,7 @@ def layers_at(sight: Sight, start: Tensor, rays: int) -> Layers:
 def _crop(index: int, p: Past, camera: Camera, box: tuple[int, int, int, int]) -> Crop:
     x0, y0, x1, y1 = box
     fit = p.view.colour_fit
-    photo = np.clip(load_photo(p.view.frame, camera)[y0:y1, x0:x1] * fit[0] + fit[1], 0, 1).astype(np.float32)
+    photo = np.clip(scaled_image(p.view.frame, camera).numpy()[y0:y1, x0:x1] * fit[0] + fit[1], 0, 1).astype(np.float32)
     h, w = p.view.shape
     rows = ((np.arange(y0, y1) + 0.5) * h / camera.height).astype(int)
     cols = ((np.arange(x0, x1) + 0.5) * w / camera.width).astype(int)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -25,13 +24,13 @@ from refield.field.warp import crossing, inside_box, outline
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
-from refield.scene.images import frame_image
+from refield.scene.images import scaled_image
 
 Array = NDArray[Any]
 Directed = Callable[[Tensor, Tensor], Tensor]
 """World points and directions (S, 3) -> the directions along which to ask for colours, (S, 3)."""
 
-_CHUNK = 8192
+_CHUNK = 16384
 _AT_ONCE = 12  # samples of a ray
 _NEGLIGIBLE = 1e-3  # weight of a sample whose colour is not asked for; the sum of what is lost stays below a grey level
 
@@ -241,24 +240,17 @@ def working_camera(camera: Camera, max_pixels: int) -> Camera:
     return camera.shrunk(shrink)
 
 
-def load_photo(frame: Frame, camera: Camera) -> Array:
-    """The frame's image as (H, W, 3) float32 in [0, 1], resampled to ``camera``."""
-    image = frame_image(frame).numpy()
-    if image.shape[:2] != (camera.height, camera.width):
-        image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return image.astype(np.float32) / 255
-
-
 def view_of(radiance: Field, frame: Frame, max_pixels: int) -> View:
     """Load one photo and render the old field beside it."""
     camera = working_camera(frame.camera, max_pixels)
     seen = see(radiance, camera_rays(camera, frame.world_from_cam))
     shape = (camera.height, camera.width)
+    rgb = seen.rgb.reshape(*shape, 3).clamp(0, 1)
     return View(
         frame,
         camera,
-        load_photo(frame, camera),
-        seen.rgb.reshape(*shape, 3).clamp(0, 1).numpy(),
+        (scaled_image(frame, camera) if frame.made is None else frame.made.at(camera, rgb)).numpy(),
+        rgb.numpy(),
         seen.depth.reshape(shape).numpy(),
         seen.opacity.reshape(shape).numpy(),
     )

@@ -15,11 +15,13 @@ from torch import Tensor
 
 from refield.estimate.lattice import Lattice, Voxels, grown
 from refield.estimate.look import Array, see
+from refield.field.outlook import Outlook
 from refield.field.radiance import Field
-from refield.field.warp import Outlook
+from refield.field.source import Source
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
+from refield.scene.pose import invert
 
 _CARVED_AWAY = 0.6  # voxels
 
@@ -100,6 +102,8 @@ class Old:
     """voxels between its surface (the field's median depth) and where the field's soft surface ends"""
     remembered: bool = False
     """its shape is that of an earlier visit; ``patches`` are of some old views only"""
+    source: Source | None = None
+    """where it is looked up, if not where it was"""
 
     @property
     def centre(self) -> Array:
@@ -143,6 +147,13 @@ class Old:
         little smoothed, so that the trilinear half level is not a staircase."""
         values = ndimage.gaussian_filter((grown(self.voxels, self.margin) & self.free).astype(np.float32), 0.7)
         return self.lattice.grid(values)
+
+    @cached_property
+    def home(self) -> tuple[OccupancyGrid, Tensor]:
+        """Its mask where it is looked up, and the motion (4, 4) from there to where it was."""
+        if self.source is None:
+            return self.grid, torch.eye(4, dtype=torch.float64)
+        return self.grid.moved(invert(self.source.now_from_then)), self.source.now_from_then
 
     @cached_property
     def shape(self) -> OccupancyGrid:

@@ -18,8 +18,8 @@ from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.look import spread_out
 from refield.estimate.objects import Old, Patch, corners_of, look_around, surface_cloud
 from refield.field.radiance import Field
+from refield.field.source import Known
 from refield.scene.capture import Frame
-from refield.scene.change import OccupancyGrid
 from refield.scene.planes import Plane
 from refield.vision import pixels
 from refield.vision.segmenter import Segmenter, cut_out
@@ -102,16 +102,16 @@ def outline(
 
 
 def remembered(
-    field: Field, frames: Sequence[Frame], grid: OccupancyGrid, planes: Sequence[Plane], config: ObjectConfig
+    field: Field, frames: Sequence[Frame], known: Known, planes: Sequence[Plane], config: ObjectConfig
 ) -> Old | None:
     """An object whose shape an earlier visit found, where it stood before this one (§11.3.2); None if no view shows it.
 
     Nothing is segmented or carved; a few old views are enough to see its colours again.
     """
-    low, high = grid.tight_aabb().numpy()
+    low, high = known.grid.tight_aabb().numpy()
     pad = 0.2 * float((high - low).max())
     lattice = Lattice.over(low - pad, high + pad, config.longest)
-    voxels = grid.contains(torch.from_numpy(lattice.centres)).numpy()
+    voxels = known.grid.contains(torch.from_numpy(lattice.centres)).numpy()
     some = spread_out(frames, config.glances)
     patches = look_around(field, some, corners_of(low - pad, high + pad), config.rays * config.glances // len(frames))
     if not patches or not voxels.any():
@@ -120,7 +120,7 @@ def remembered(
     free = _free(lattice, planes)
     if len(cloud.points) < FEWEST_POINTS:
         return None
-    return Old(lattice, voxels, free, cloud, tuple(patches), remembered=True)
+    return Old(lattice, voxels, free, cloud, tuple(patches), remembered=True, source=known.source)
 
 
 def _free(lattice: Lattice, planes: Sequence[Plane]) -> Voxels:

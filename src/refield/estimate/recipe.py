@@ -26,8 +26,9 @@ from refield.estimate.place import PlaceConfig, place
 from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
 from refield.field.radiance import Field
+from refield.field.source import Known
 from refield.scene.capture import Capture, Frame
-from refield.scene.change import OccupancyGrid, PlacedPhoto, SceneChange
+from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
 from refield.scene.planes import Plane, rough_planes
 
@@ -81,7 +82,7 @@ class _Scene:
     planes: list[Plane]
     """what holds things up"""
     models: Models
-    known: tuple[OccupancyGrid, ...]
+    known: tuple[Known, ...]
     """objects that earlier visits found, where they stood before this one"""
 
 
@@ -92,7 +93,7 @@ def estimate_change(
     config: EstimateConfig = EstimateConfig(),
     on_stage: OnStage | None = None,
     models: Models | None = None,
-    known: Sequence[OccupancyGrid] = (),
+    known: Sequence[Known] = (),
 ) -> SceneChange:
     """What moved, left or arrived between the capture that ``field`` was fitted to and a few new photos (§4.2).
 
@@ -101,8 +102,8 @@ def estimate_change(
         on_stage: called with each step's name as it begins.
         models: a segmenter that tells things from what is behind them in the old field's pictures, and a matcher;
             those that the config names if not given.
-        known: shapes that earlier visits found, where the objects stood before this one: if one of them moves again,
-            it need not be segmented again (§11.3.2).
+        known: what earlier visits found, where it stood before this one: an object that moves again need not be
+            segmented again (§11.3.2).
 
     Raises:
         InputError: most of the pixels changed: the photos show another scene; or a model cannot be opened.
@@ -223,9 +224,9 @@ def _were_there(scene: _Scene, carved: Hull, parts: Sequence[Voxels], known: Seq
         at = carved.lattice.centres[part]
         if any(old.lattice.holds(grown(old.voxels, old.margin), at).mean() > 0.5 for old in (*known, *found)):
             continue
-        grid = next((g for g in scene.known if g.contains(torch.from_numpy(at)).float().mean() > 0.5), None)
-        if grid is not None:
-            old = remembered(scene.field, scene.capture.train, grid, scene.planes, config.objects)
+        again = next((k for k in scene.known if k.grid.contains(torch.from_numpy(at)).float().mean() > 0.5), None)
+        if again is not None:
+            old = remembered(scene.field, scene.capture.train, again, scene.planes, config.objects)
             if old is not None:
                 found.append(old)
                 continue

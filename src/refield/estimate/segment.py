@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refield.estimate.carve_kernels import find_hits
 from refield.estimate.lattice import grown
 from refield.estimate.objects import Old, box_in, corners_of, patch_rays
 from refield.scene.capture import Frame
@@ -55,16 +54,6 @@ def _projected(frame: Frame, grid: OccupancyGrid) -> Tensor:
     box = box_in(camera, frame, corners_of(low, high))
     if box is not None:
         x0, y0, x1, y1 = box
-        rays = patch_rays(camera, frame, box)
-        hit = meets(grid, rays.origins, rays.directions)
+        hit = grid.met_by(patch_rays(camera, frame, box))
         out[y0:y1, x0:x1] = hit.reshape(y1 - y0, x1 - x0).numpy()
     return _tidy(out)
-
-
-def meets(grid: OccupancyGrid, origins: Tensor, directions: Tensor, steps: int = 40) -> Tensor:
-    """Whether rays pass through the grid's inside, (N,) bool."""
-    out = torch.zeros(len(origins), dtype=torch.bool)
-    rays = origins.contiguous().numpy(), directions.contiguous().numpy()
-    values, box, tight = grid.values.contiguous(), grid.aabb.double(), grid.tight_aabb().double()
-    find_hits(*rays, values.numpy(), box.numpy(), tight.numpy(), steps, out.numpy())
-    return out

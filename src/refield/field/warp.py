@@ -6,21 +6,16 @@ asks at ``old_from_new @ x``, along the direction turned back by the same rotati
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter
 from torch import Tensor
-from torch.nn import functional
 
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
+from refield.scene.inside import in_boxes
 from refield.scene.pose import invert, rotate, transform
-
-_FRONTAL = 0.3  # cosine between a side's normal and the way to a camera from which on its photo shows the side well
 
 
 @dataclass(frozen=True)
@@ -97,56 +92,6 @@ def looked_up(x: Tensor, d: Tensor, owner: Tensor, poses: list[Tensor]) -> tuple
     return x, d
 
 
-@dataclass(frozen=True)
-class Outlook:
-    """The directions along which each side of an object was looked at when its field was fitted."""
-
-    directions: Tensor
-    """(C, 3) unit, from the cameras to the object"""
-    reach: float
-    """Radians around each of them within which the field may be asked"""
-    aabb: Tensor
-    """(2, 3) world box of the normals"""
-    normals: Tensor
-    """(X, Y, Z, 3) unit, outwards, at the nodes of a lattice; zero away from the surface"""
-
-    @staticmethod
-    def from_eyes(eyes: Tensor, grid: OccupancyGrid) -> Outlook:
-        """Camera centres (C, 3), the object's grid. The reach is half the cameras' usual spacing."""
-        d = functional.normalize(outline(grid).mean(0) - eyes, dim=-1)
-        nearest = (d @ d.T).fill_diagonal_(-1).amax(-1).clamp(-1, 1).acos()
-        reach = 0.5 * float(nearest.median()) if len(d) > 1 else 0.0
-        smooth = gaussian_filter(grid.values.double().numpy(), 2.0)
-        slope = torch.from_numpy(np.stack(np.gradient(smooth), -1)).float()
-        return Outlook(d, reach, grid.aabb, -functional.normalize(slope, dim=-1))
-
-    def held(self, x: Tensor, d: Tensor) -> Tensor:
-        """Directions (S, 3) at points of the object at its old place (S, 3), those out of reach replaced by the
-        nearest within it.
-
-        What a fitted colour says along directions that no photo looked along is accidental: a tipped object is asked
-        from below, where nobody was, a turned one's side from where nobody saw that side.
-        """
-        cosine = d.detach() @ self.directions.T
-        facing = -self._normal(x.detach()) @ self.directions.T
-        frontal = facing > _FRONTAL
-        frontal |= ~frontal.any(-1, keepdim=True)
-        cosine, nearest = torch.where(frontal, cosine, -2.0).max(-1)
-        out = (cosine < math.cos(self.reach)).nonzero()[:, 0]
-        if len(out) == 0:
-            return d
-        axis = self.directions[nearest[out]]
-        across = functional.normalize(d[out] - (d[out] * axis).sum(-1, keepdim=True) * axis, dim=-1)
-        return d.index_copy(0, out, math.cos(self.reach) * axis + math.sin(self.reach) * across)
-
-    def _normal(self, x: Tensor) -> Tensor:
-        """The normal at the node nearest to each point, (S, 3)."""
-        size = torch.tensor(self.normals.shape[:3])
-        at = ((x - self.aabb[0]) / (self.aabb[1] - self.aabb[0]) * (size - 1)).round().long()
-        i, j, k = at.clamp_min(0).minimum(size - 1).unbind(-1)
-        return self.normals[i, j, k]
-
-
 def outline(grid: OccupancyGrid) -> Tensor:
     """(2, 3) float32, a world box that holds every point the grid contains: its occupied nodes and one cell more."""
     box = grid.tight_aabb()
@@ -156,8 +101,7 @@ def outline(grid: OccupancyGrid) -> Tensor:
 
 def inside_box(x: Tensor, box: Tensor) -> Tensor:
     """World points (..., 3), world box (2, 3) -> (...,) bool."""
-    lo, hi = box.to(x.device, x.dtype)
-    return ((x >= lo) & (x <= hi)).all(-1)
+    return in_boxes(x.reshape(-1, 3), box[None]).reshape(x.shape[:-1])
 
 
 def crossing(rays: Rays, box: Tensor) -> tuple[Tensor, Tensor]:

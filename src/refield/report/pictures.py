@@ -32,7 +32,7 @@ def data_uri(image: Tensor) -> str:
         picture = picture.resize((WIDEST, round(picture.height * WIDEST / picture.width)), Image.Resampling.LANCZOS)
     kind = "PNG" if picture.width * picture.height <= _PNG_PIXELS else "JPEG"
     buffer = io.BytesIO()
-    picture.save(buffer, kind, **({"optimize": True} if kind == "PNG" else {"quality": 90}))
+    picture.save(buffer, kind, **({} if kind == "PNG" else {"quality": 90}))
     return f"data:image/{kind.lower()};base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
@@ -71,7 +71,7 @@ def write_contact_sheet(path: Path | str, views: Sequence[Comparison], height: i
             sheet.paste(row[i], (x, _CAPTION + _GAP // 2 + j * (height + _GAP)))
         x += widths[i] + _GAP
     buffer = io.BytesIO()
-    sheet.save(buffer, "PNG", optimize=True)
+    sheet.save(buffer, "PNG")
     write_bytes(Path(path), buffer.getvalue())
     return Path(path)
 

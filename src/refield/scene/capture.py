@@ -6,14 +6,26 @@ photo cannot be used as a view by mistake. World units and axes are the capture'
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from refield.scene.camera import Camera
+
+
+class Made(Protocol):
+    """How a photo that is not there yet comes about."""
+
+    def __call__(self, path: Path) -> None:
+        """Write it."""
+
+    def at(self, camera: Camera, now: Tensor) -> Tensor:
+        """The photo (H, W, 3) float32 in [0, 1] as its ``camera``, scaled down, takes it; nothing is written. ``now``,
+        of the same shape, is what the scene's field shows there."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +36,7 @@ class Photo:
     camera: Camera
     name: str
     """How the file calls it (the ``file_path`` of a transforms.json); unique within a capture."""
-    made: Callable[[Path], None] | None = field(default=None, kw_only=True, repr=False, compare=False)
+    made: Made | None = field(default=None, kw_only=True, repr=False, compare=False)
     """Writes the file when its pixels are first asked for; None for a file that is there."""
 
 

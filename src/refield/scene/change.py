@@ -13,9 +13,9 @@ from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from refield.scene.capture import Frame
+from refield.scene.capture import Frame, Rays
+from refield.scene.inside import in_grid, meet_grid, trilinear
 from refield.scene.pose import invert, transform
 
 Kind = Literal["moved", "removed", "added"]
@@ -32,17 +32,17 @@ class OccupancyGrid:
 
     def sample(self, x: Tensor) -> Tensor:
         """Trilinear value at world points (..., 3) -> (...,); 0 outside the box."""
-        lo, hi = self.aabb.to(x.device, x.dtype)
-        unit = (x - lo) / (hi - lo) * 2 - 1
-        grid = self.values.to(x.device, x.dtype)[None, None]
-        flat = unit.flip(-1).reshape(1, -1, 1, 1, 3)  # grid_sample's first coordinate runs along the last axis
-        out = functional.grid_sample(grid, flat, mode="bilinear", padding_mode="border", align_corners=True)
-        inside = (unit.abs() <= 1).all(-1)
-        return torch.where(inside, out.reshape(x.shape[:-1]), torch.zeros_like(x[..., 0]))
+        return trilinear(x, self.aabb, self.values)
 
     def contains(self, x: Tensor) -> Tensor:
         """M(x): world points (..., 3) -> (...,) bool, trilinear value > 0.5 (§4.2.4)."""
-        return self.sample(x) > 0.5
+        flat = x.detach().reshape(-1, 3)
+        return in_grid(flat, self.aabb, self.values, 0.5).reshape(x.shape[:-1])
+
+    def met_by(self, rays: Rays, places: int = 40) -> Tensor:
+        """Whether each of N rays passes through the object, at one of so many places on its way, (N,) bool."""
+        tight = self.tight_aabb()
+        return meet_grid((rays.origins, rays.directions), self.aabb, self.values, 0.5, tight, places)
 
     def nodes(self) -> Tensor:
         """World positions of the nodes, (X, Y, Z, 3) float32."""

@@ -11,11 +11,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from PIL import ExifTags, Image, ImageOps, PngImagePlugin
 from torch import Tensor
 
+from refield.scene.camera import Camera
 from refield.scene.capture import Photo
 from refield.scene.errors import InputError
 from refield.scene.files import write_bytes
@@ -111,11 +113,9 @@ def read_mask(path: Path, *, max_pixels: int = MAX_PIXELS) -> Tensor:
 
 
 def write_image(path: Path, image: Tensor) -> None:
-    """Write a PNG at once: uint8 or float [0, 1] (H, W, 3) or (H, W), or a bool (H, W) mask as 0 and 255."""
+    """Write a PNG at once: uint8 or float [0, 1] (H, W, 3) or (H, W), or a bool (H, W) mask in one bit a pixel."""
     image = image.detach().cpu()
-    if image.dtype == torch.bool:
-        image = image.to(torch.uint8) * 255
-    elif image.is_floating_point():
+    if image.is_floating_point():
         if not bool(image.isfinite().all()):
             raise ValueError(f"{path}: the picture holds values that are not finite")
         image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
@@ -162,3 +162,15 @@ def frame_image(photo: Photo) -> Tensor:
         expected = f"its camera says {photo.camera.width}x{photo.camera.height}"
         raise InputError(photo.path, f"has {width}x{height} pixels, {expected}", "correct w and h, or the image")
     return image
+
+
+def scaled_image(photo: Photo, camera: Camera) -> Tensor:
+    """The pixels of a photo as ``camera``, its own scaled down, would take it, (H, W, 3) float32 in [0, 1].
+
+    Raises:
+        InputError: as `frame_image`.
+    """
+    image = frame_image(photo).numpy()
+    if image.shape[:2] != (camera.height, camera.width):
+        image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(image.astype(np.float32) / 255)

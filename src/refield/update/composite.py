@@ -15,13 +15,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from refield.field.outlook import Outlook
 from refield.field.radiance import Field, HashField
 from refield.field.render import visible_samples
 from refield.field.sampling import OccupancySampler
+from refield.field.source import Source
 from refield.field.volrend import Samples
-from refield.field.warp import Move, Outlook, crossing, inside_box, looked_up, moves_of, owners
+from refield.field.warp import Move, crossing, inside_box, looked_up, moves_of, owners
 from refield.scene.capture import Rays
-from refield.scene.change import SceneChange
+from refield.scene.change import OccupancyGrid, SceneChange
+from refield.scene.inside import in_boxes
+from refield.scene.pose import invert, rotate, transform
 from refield.update.light import Relighting
 from refield.update.region import Region, carved, grown, move_out
 
@@ -110,7 +114,8 @@ class UpdatedField:
         self.region = region
         self.moves: tuple[Move, ...] = moves_of(_part(change, self.skipped))
         self._shells = tuple(Move(grown(m.grid, SKIN * pretrained.sampler.step), m.new_from_old) for m in self.moves)
-        self._outlooks = [] if eyes is None else [Outlook.from_eyes(eyes, m.grid) for m in self.moves]
+        self.outlooks = tuple(None if eyes is None else Outlook.from_eyes(eyes, m.grid) for m in self.moves)
+        self.sources = tuple(source_of(pretrained, m.grid) for m in self.moves)
         self.sampler_step = pretrained.sampler.step
         self.boxes = tuple(m.box_now for m in self._shells) + region.boxes + earlier.places.boxes
         if sampler is None:
@@ -121,6 +126,7 @@ class UpdatedField:
         # a cell whose centre is just outside may hold a corner that is inside
         self._retold = functional.max_pool3d(self._told[None, None].float(), 3, 1, 1)[0, 0].to(torch.uint8)
         before = pretrained._marched if isinstance(pretrained, UpdatedField) else ()
+        self._split_of: tuple[Tensor, tuple[OccupancySampler, OccupancySampler]] | None = None
         self._marched: tuple[Tensor, ...] = tuple(_by_cells(self.sampler, b) for b in self.boxes) + before
 
     @property
@@ -143,16 +149,25 @@ class UpdatedField:
         """
         if self._base is None or not self._marched:
             return visible_samples(self.pretrained, rays, jitter) if not self.boxes else self.sampler(rays, jitter)
-        known = replace(self.sampler, grid=self.sampler.grid * (1 - self._retold))
+        known, _ = self._split
         return interleaved(known.visible(rays, self._base.density_net, jitter), self._retold_samples(rays, jitter))
+
+    @property
+    def _split(self) -> tuple[OccupancySampler, OccupancySampler]:
+        """The sampler of what never changed and that of the rest; kept, since marching remembers a grid."""
+        if self._split_of is None or self._split_of[0] is not self.sampler.grid:
+            grid, told = self.sampler.grid, self._retold
+            parts = replace(self.sampler, grid=grid * (1 - told)), replace(self.sampler, grid=grid * told)
+            self._split_of = grid, parts
+        return self._split_of[1]
 
     def _retold_samples(self, rays: Rays, jitter: bool) -> Samples:
         """All samples in cells that changed; only the rays that come near any are marched, and no further."""
         exits = torch.stack([leaving(rays, box) for box in self._marched]).amax(0)
         near = (exits > 0).nonzero()[:, 0]
         far = float(exits.max()) / self.sampler.contraction.radius if len(near) else 0.0
-        marcher = replace(self.sampler, grid=self.sampler.grid * self._retold, far=min(far, self.sampler.far))
-        found = marcher(rays[near], jitter)
+        _, told = self._split
+        found = replace(told, far=min(far, told.far))(rays[near], jitter)
         counts = near.new_zeros(len(rays)).index_copy(0, near, found.ray_offsets.diff())
         return Samples(found.t_starts, found.t_ends, torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
 
@@ -176,6 +191,8 @@ class UpdatedField:
         flat = x.reshape(-1, 3)
         to = self._route(flat, torch.zeros_like(flat))
         sigma = flat.new_zeros(len(flat)).index_copy(0, to.old, self.pretrained.density(to.asked[to.old]))
+        for i, rows in to.sourced:
+            sigma = sigma.index_copy(0, rows, self.source(i).density(self._then(i, to.asked[rows])))
         for field, rows in ((self.helper, to.helper), (self.earlier.ground, to.ground)):
             if field is not None and len(rows):
                 sigma = sigma.index_copy(0, rows, field.density(flat[rows]))
@@ -189,6 +206,11 @@ class UpdatedField:
         c = self._relit(to.asked[to.old], c, to.owner[to.old])
         sigma = flat.new_zeros(len(flat)).index_copy(0, to.old, s)
         rgb = torch.zeros_like(flat).index_copy(0, to.old, c)
+        for i, rows in to.sourced:
+            source = self.source(i)
+            s, c = source(self._then(i, to.asked[rows]), rotate(invert(source.now_from_then), to.turned[rows]))
+            c = self._relit(to.asked[rows], c, to.owner[rows])
+            sigma, rgb = sigma.index_copy(0, rows, s), rgb.index_copy(0, rows, c)
         if self.helper is not None and len(to.helper):
             s, c = self.helper(flat[to.helper], along[to.helper])
             sigma, rgb = sigma.index_copy(0, to.helper, s), rgb.index_copy(0, to.helper, c)
@@ -203,7 +225,7 @@ class UpdatedField:
         owner = torch.full(x.shape[:1], -1, dtype=torch.long, device=x.device)
         near = self._near(x.detach()).nonzero()[:, 0]
         if len(near) == 0:
-            return _Routed(x, d, owner, torch.arange(len(x), device=x.device), near, near)
+            return _Routed(x, d, owner, torch.arange(len(x), device=x.device), near, near, ())
         mover = self.arrived(x[near])
         owner[near] = mover
         helped = (mover < 0) & self.region.contains(x[near])
@@ -211,13 +233,29 @@ class UpdatedField:
             helped &= ~self.untaught.contains(x[near]) | self._was.contains(x[near])
         grounded = (mover < 0) & ~helped & self.earlier.places.contains(x[near])
         at, along = looked_up(x[near], d[near], mover, [m.old_from_new for m in self.moves])
-        for i, outlook in enumerate(self._outlooks):
+        sourced = []
+        for i, (outlook, source) in enumerate(zip(self.outlooks, self.sources)):
             mine = (mover == i).nonzero()[:, 0]
-            along = along.index_copy(0, mine, outlook.held(at[mine], along[mine]))
+            if source is not None:
+                sourced.append((i, near[mine]))
+            elif outlook is not None:
+                along = along.index_copy(0, mine, outlook.held(at[mine], along[mine]))
         asked, turned = x.index_copy(0, near, at), d.index_copy(0, near, along)
         old = torch.ones(len(x), dtype=torch.bool, device=x.device)
         old[near] = ~(helped | grounded)
-        return _Routed(asked, turned, owner, old.nonzero()[:, 0], near[helped], near[grounded])
+        for _, rows in sourced:
+            old[rows] = False
+        return _Routed(asked, turned, owner, old.nonzero()[:, 0], near[helped], near[grounded], tuple(sourced))
+
+    def source(self, i: int) -> Source:
+        """Of a move that has one."""
+        source = self.sources[i]
+        assert source is not None
+        return source
+
+    def _then(self, i: int, x: Tensor) -> Tensor:
+        """Where its source has what was at points (S, 3) before a move."""
+        return transform(invert(self.source(i).now_from_then), x)
 
     def arrived(self, x: Tensor) -> Tensor:
         """Which move each world point (S, 3) is answered by, (S,) int64, -1 for none.
@@ -236,17 +274,15 @@ class UpdatedField:
         return torch.where(self.bare.contains(x), -1, owner) if self.bare.grids else owner
 
     def _near(self, x: Tensor) -> Tensor:
-        near = torch.zeros(len(x), dtype=torch.bool, device=x.device)
-        for box in self.boxes:
-            near |= inside_box(x, box)
-        return near
+        return in_boxes(x, torch.stack(self.boxes)) if self.boxes else torch.zeros_like(x[:, 0], dtype=torch.bool)
 
     def _relit(self, asked: Tensor, rgb: Tensor, owner: Tensor) -> Tensor:
         """Colours of the old field (S, 3), asked for at (S, 3), in the new light; ``owner`` (S,) is -1 for what did
         not move."""
         for i, light in enumerate((self.light, *self.shading), start=-1):
             if light is not None:
-                rgb = torch.where((owner == i)[:, None], light.applied(asked, rgb), rgb)
+                mine = (owner == i).nonzero()[:, 0]
+                rgb = rgb.index_copy(0, mine, light.applied(asked[mine], rgb[mine]))
         return rgb
 
 
@@ -266,6 +302,32 @@ class _Routed:
     """rows of the helper; of nobody where there is none"""
     ground: Tensor
     """rows of the earlier state that knows the place"""
+    sourced: tuple[tuple[int, Tensor], ...]
+    """moves that have a source, and the rows that it answers for"""
+
+
+def source_of(field: Field, grid: OccupancyGrid) -> Source | None:
+    """Where a field that has had updates looks up the object that ``grid`` holds; None if it does not move it, or has
+    learnt parts of it since."""
+    if not isinstance(field, UpdatedField):
+        return None
+    centre = grid.tight_aabb().mean(0, keepdim=True)
+    to = field._route(centre, torch.zeros_like(centre))
+    i = int(to.owner[0])
+    if len(to.helper) or len(to.ground):
+        return None
+    if i < 0:
+        found = source_of(field.pretrained, grid)
+        light, pose = field.light, torch.eye(4, dtype=torch.float64)
+    else:
+        if any(bool(inside_box(bare.aabb.mean(0), field.moves[i].box_now)) for bare in field.bare.grids):
+            return None
+        found = field.sources[i] or Source(field.pretrained, torch.eye(4, dtype=torch.float64), field.outlooks[i])
+        light, pose = field.shading[i] if i < len(field.shading) else None, field.moves[i].new_from_old
+    if found is None:
+        return None
+    lights = found.lights if light is None else (*found.lights, (found.now_from_then, light))
+    return replace(found, now_from_then=pose @ found.now_from_then, lights=lights)
 
 
 def layers_of(field: Field) -> Iterator[UpdatedField]:

@@ -18,7 +18,7 @@ class UpdateConfig:
     """Old photos: pixels further away than this, in image widths, do not teach (§10.1.3)."""
     relight: bool = True
     """Fit how the light on unchanged surfaces changed."""
-    steps: int = 400
+    steps: int = 200
     """of gradient descent"""
     max_seconds: float = 20.0
     """for all of the steps; the learning rate follows whichever of steps and seconds is further on"""
@@ -36,7 +36,7 @@ class UpdateConfig:
     """weight of the colour that comes from where nothing can be: deep inside what left, where nothing was before"""
     held_out: int = 20
     """every so-many-th pixel that could teach is kept to judge by"""
-    check_every: int = 50
+    check_every: int = 25
     """steps between looks at the held-out pixels"""
     patience: int = 3
     """looks without ``least_gain`` after which training stops"""

@@ -10,8 +10,7 @@ import torch
 from refield.field.render import render_many
 from refield.scene.capture import Frame
 from refield.update.composite import UpdatedField
-from refield.update.region import Region
-from refield.update.supervision import Lessons, finely, silhouette
+from refield.update.supervision import Lessons, silhouette
 
 _PIXELS = 20_000  # compared
 # What an earlier visit says of a place may be so many times as wrong as what did not change (a helper's ground, a
@@ -19,15 +18,18 @@ _PIXELS = 20_000  # compared
 _TRUST, _BLUNDER = 3.0, 2.5e-3
 
 
-def as_remembered(cut: UpdatedField, sparse: Lessons, changed: Sequence[np.ndarray]) -> bool:
+def as_remembered(
+    cut: UpdatedField, sparse: Lessons, changed: Sequence[np.ndarray], recalled: Sequence[np.ndarray]
+) -> bool:
     """Whether the new photos show what earlier visits say is there, about as well as what did not change at all.
 
-    ``sparse`` are all pixels of the change's photos in order, ``changed`` their changed ones, (H, W) bool each.
+    ``sparse`` are all pixels of the change's photos in order, ``changed`` their changed ones, ``recalled`` their
+    `recalled_pixels`, (H, W) bool each.
     """
-    known = torch.cat([torch.from_numpy(recalled_pixels(cut, f)).reshape(-1) for f in cut.change.frames])
+    known = torch.cat([torch.from_numpy(r).reshape(-1) for r in recalled])
     still = ~torch.cat([torch.from_numpy(c).reshape(-1) for c in changed])
-    recalled, same = (_error(cut, sparse, which) for which in (known, still))
-    return recalled < _TRUST * same + _BLUNDER
+    told, same = (_error(cut, sparse, which) for which in (known, still))
+    return told < _TRUST * same + _BLUNDER
 
 
 def recalled_pixels(cut: UpdatedField, frame: Frame) -> np.ndarray:
@@ -39,7 +41,7 @@ def recalled_pixels(cut: UpdatedField, frame: Frame) -> np.ndarray:
     known += [now for p in earlier.undone if (now := objects[p.object].grid_now) is not None]
     other = [m.grid.moved(m.new_from_old) for m in cut.moves] + [o.grid for o in cut.to_learn.objects]
     other += earlier.unknown.grids
-    return _silhouette(Region(tuple(known)), frame) & ~_silhouette(Region(tuple(other)), frame)
+    return silhouette(known, frame) & ~silhouette(other, frame)
 
 
 def _error(field: UpdatedField, seen: Lessons, which: torch.Tensor) -> float:
@@ -47,10 +49,3 @@ def _error(field: UpdatedField, seen: Lessons, which: torch.Tensor) -> float:
     rows = which.nonzero()[:, 0]
     some = seen[rows[torch.randperm(len(rows))[:_PIXELS]]]
     return float((render_many(field, some.rays).rgb - some.rgb).square().mean()) if len(rows) else 0.0
-
-
-def _silhouette(region: Region, frame: Frame) -> np.ndarray:
-    """(H, W) bool; nothing for an empty region."""
-    if not region.grids:
-        return np.zeros((frame.camera.height, frame.camera.width), bool)
-    return silhouette(finely(region), frame)

@@ -17,10 +17,8 @@ from torch import Tensor
 from refield.field.pixels import PixelBank
 from refield.field.radiance import Field
 from refield.field.render import render_many
-from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid, SceneChange
-from refield.update.region import Region, meets
 from refield.vision.pixels import dilate, fit_colours
 
 _UNTOUCHED_MARGIN = 0.03  # of the width: changed areas grow by this before colours are compared across visits
@@ -57,8 +55,8 @@ class Place:
 
     masks: tuple[Tensor | None, ...]
     """What the estimate saw of it in the old training photos; may be empty"""
-    sampler: OccupancySampler
-    """Looks inside the object and nowhere else"""
+    grid: OccupancyGrid
+    """The object, there"""
     arrived_only: bool
     """An added object's: nothing stood there before"""
 
@@ -72,19 +70,16 @@ class Place:
 
     def silhouette(self, frame: Frame) -> np.ndarray:
         """Where the object projects in a photo, hidden or not, (H, W) bool."""
-        return silhouette(self.sampler, frame)
+        return silhouette((self.grid,), frame)
 
 
-def silhouette(sampler: OccupancySampler, frame: Frame) -> np.ndarray:
-    """Where what a sampler looks at projects in a photo, hidden or not, (H, W) bool."""
-    hit = meets(sampler, camera_rays(frame.camera, frame.world_from_cam))
+def silhouette(grids: Sequence[OccupancyGrid], frame: Frame) -> np.ndarray:
+    """Where what any of the grids holds projects in a photo, hidden or not, (H, W) bool."""
+    rays = camera_rays(frame.camera, frame.world_from_cam)
+    hit = torch.zeros(len(rays), dtype=torch.bool)
+    for grid in grids:
+        hit |= grid.met_by(rays)
     return hit.reshape(frame.camera.height, frame.camera.width).numpy()
-
-
-def finely(region: Region) -> OccupancySampler:
-    """A sampler for `silhouette`; the region is not empty."""
-    size = float((region.box[1] - region.box[0]).max())
-    return region.sampler(size / 100, resolution=128)
 
 
 @dataclass(frozen=True)
@@ -103,8 +98,7 @@ def places_of(change: SceneChange) -> Places:
 
 
 def _place(grid: OccupancyGrid, masks: tuple[Tensor | None, ...], arrived_only: bool) -> Place:
-    size = float((grid.aabb[1] - grid.aabb[0]).max())
-    return Place(masks, Region((grid,)).sampler(size / 100, resolution=128), arrived_only)
+    return Place(masks, grid, arrived_only)
 
 
 def old_ring(places: Places, index: int, frame: Frame, shadow: float, far: float) -> Tensor | None:

@@ -128,6 +128,8 @@ class _Known:
     """all pixels of the new photos"""
     changed: tuple[np.ndarray, ...]
     """of each new photo, (H, W) bool: what arrived or left"""
+    recalled: tuple[np.ndarray, ...]
+    """of each new photo, (H, W) bool: what only an earlier visit knows"""
 
 
 def _known_of(capture: Capture, field: Field, cut: UpdatedField) -> _Known:
@@ -136,13 +138,15 @@ def _known_of(capture: Capture, field: Field, cut: UpdatedField) -> _Known:
     places = places_of(change)
     changed = tuple(changed_pixels(change, places, i, f) for i, f in enumerate(change.frames))
     sparse = new_lessons(change.frames, cut, changed)
-    if cut.earlier and not as_remembered(cut, sparse, changed):
+    recalled = tuple(recalled_pixels(cut, f) for f in change.frames)
+    if cut.earlier and not as_remembered(cut, sparse, changed, recalled):
         cut = UpdatedField(field, change, eyes=eyes)
+        recalled = tuple(np.zeros_like(r) for r in recalled)
     bare = bare_skin(cut, capture.train, change)
     if bare.grids:
         empty = Region(cut.region.grids + bare.grids)
         cut = UpdatedField(cut.pretrained, change, region=empty, eyes=eyes, bare=bare, earlier=cut.earlier)
-    return _Known(cut, sparse, changed)
+    return _Known(cut, sparse, changed, recalled)
 
 
 def _fixed(frozen: UpdatedField, region: OccupancySampler, rays: Rays, ground: Sequence[Foothold]) -> Segments:
@@ -177,7 +181,7 @@ def _light(known: _Known) -> Relighting | None:
     box = Region(tuple(g for o in change.objects for g in (o.grid, o.grid_now) if g is not None)).box
     side = max(float((o.grid.tight_aabb().diff(dim=0)).max()) for o in change.objects)
     box = torch.stack([box[0] - 1.5 * side, box[1] + 1.5 * side])
-    unknown = [c & ~recalled_pixels(known.cut, f) for c, f in zip(known.changed, change.frames)]
+    unknown = [c & ~r for c, r in zip(known.changed, known.recalled)]
     still = torch.cat([torch.from_numpy(~dilate(c, math.ceil(0.01 * c.shape[1]))).reshape(-1) for c in unknown])
     may = (still & (leaving(sparse.rays, box) > 0)).nonzero()[:, 0]
     seen = sparse[may[torch.randperm(len(may))[:_LIT_RAYS].sort().values]]

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.estimate.detect import Mask
-from refield.estimate.look import Array, View, load_photo, working_camera
+from refield.estimate.look import Array, View, working_camera
 from refield.estimate.paper.detect import Box, enlarged
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame
 from refield.scene.change import OccupancyGrid
+from refield.scene.images import scaled_image
 from refield.vision import pixels
 from refield.vision.segmenter import Segmenter
 
@@ -85,7 +86,7 @@ def _old_mask(frame: Frame, camera: Camera, cloud: Array, segmenter: Segmenter, 
     box = projected_box(cloud, camera, frame.world_from_cam, config.box)
     if box is None:  # that it is not in the picture is known
         return OldMask(frame, camera, np.zeros((camera.height, camera.width), bool))
-    masks, scores = segmenter.masks(pixels.to_bytes(load_photo(frame, camera)), box[None])
+    masks, scores = segmenter.masks(pixels.to_bytes(scaled_image(frame, camera).numpy()), box[None])
     sure = bool(scores[0] >= config.confidence and masks[0].any())
     return OldMask(frame, camera, masks[0] if sure else None)
 

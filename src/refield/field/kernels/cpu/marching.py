@@ -55,7 +55,7 @@ def reach(grid: Tensor) -> np.ndarray:
         if known() is grid and version == grid._version:
             return found
     found = _reach(array(grid))
-    _reaches[:] = [(weakref.ref(grid), grid._version, found), *_reaches[:3]]
+    _reaches[:] = [(weakref.ref(grid), grid._version, found), *_reaches[:7]]
     return found
 
 
