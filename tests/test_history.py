@@ -33,6 +33,14 @@ def test_old_photos_are_brought_up_to_date_when_they_are_looked_at(tmp_path):
     same = (image - photo).abs().amax(-1) < 0.01
     assert same.any() and not same[differs].all()
     assert torch.equal(frame_image(frame), (image * 255).to(torch.uint8))  # and not made again
+    assert frame.made is not None
+    at_once = frame.made.at(frame.camera, shown[1])  # the same, without a file
+    assert (
+        float((at_once - image).abs().amax()) < 0.05 and float(((at_once - image).abs() > 0.01).float().mean()) < 0.05
+    )
+    small = frame.camera.shrunk(0.5)
+    halved = frame.made.at(small, render_camera(now, small, frame.world_from_cam).rgb)
+    assert halved.shape == (small.height, small.width, 3)
 
 
 def test_what_moved_is_known_where_it_is_now():

@@ -13,8 +13,7 @@ from refield.estimate.look import View
 from refield.estimate.objects import Patch
 from refield.estimate.outline import carve_solid
 from refield.scene.camera import Camera
-from refield.scene.capture import Frame, Rays
-from refield.scene.change import OccupancyGrid
+from refield.scene.capture import Frame
 from tests.estimate.boxes import camera_at
 
 CONFIG = HullConfig(surface=8.0)
@@ -138,27 +137,6 @@ def test_the_solid_is_carved_by_rectangles_of_views(tmp_path, rng, through, deep
     assert 0 < expected.sum() < expected.size
     np.testing.assert_array_equal(carve_solid(lattice, patches, through, deepest), expected)
     assert not carve_solid(lattice, [], through, deepest).any()
-
-
-def test_rays_that_meet_a_shape(rng):
-    values = ndimage.gaussian_filter(rng.standard_normal((14, 9, 11)), 1.5).astype(np.float32)
-    grid = OccupancyGrid(
-        torch.tensor([[-0.5, -0.3, 0.1], [0.4, 0.5, 0.8]]), torch.from_numpy(values / values.max() / 2 + 0.4)
-    )
-    origins = torch.from_numpy(rng.uniform(-1.5, 1.5, (4000, 3)).astype(np.float32))
-    aim = torch.from_numpy(rng.uniform(-0.5, 0.8, (4000, 3)).astype(np.float32)) - origins
-    aim[::7] *= -1
-    aim[::5, 1] = 0  # along a wall of the box
-    directions = torch.nn.functional.normalize(aim, dim=-1)
-    # ray by ray, the places where the shape is asked for
-    o, d = origins.double(), directions.double()
-    inverse = 1 / torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
-    a, b = ((side - o) * inverse for side in grid.tight_aabb().double())
-    near, far = torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)
-    t = near[:, None] + (far - near)[:, None] * (torch.arange(40) + 0.5) / 40
-    expected = (far > near) & grid.contains(o[:, None] + d[:, None] * t[..., None]).any(1)
-    assert 0.1 < expected.float().mean() < 0.9
-    assert torch.equal(grid.met_by(Rays(origins, directions)), expected)
 
 
 @pytest.mark.parametrize("steps", [-1, 0, 1, 2, 5, 30])

@@ -8,9 +8,11 @@ import torch
 from refield.field.render import render_rays
 from refield.scene.capture import Rays
 from refield.scene.change import ObjectChange, SceneChange
-from refield.scene.pose import invert
-from refield.update.composite import Origin, UpdatedField
+from refield.scene.pose import invert, rotate, transform
+from refield.update.composite import Origin, UpdatedField, source_of
+from refield.update.light import Relighting
 from refield.update.recall import earlier_of, without
+from refield.update.region import Region, carved, move_out
 from refield.update.store import load_updated, save_updated
 from tests.fields import small_field
 from tests.update.worlds import Ball, BallWorld, at, grid_of, moved, views
@@ -46,6 +48,45 @@ def test_a_second_move_uncovers_what_was_there():
     error = (render_rays(again, rays).rgb - render_rays(truth, rays).rgb).abs()
     assert float(error.mean()) < 0.01
     assert float((error.amax(-1) > 0.2).float().mean()) < 0.02  # edges
+
+
+def test_however_often_it_moved_it_is_looked_up_where_it_first_was():
+    before, _ = first_visit()
+    nodes = torch.randn(3, 3, 3, 3, generator=torch.Generator().manual_seed(0)) / 5
+    boxes = [carved(SceneChange((moved(ball(p), BEYOND),))).box for p in (HERE, THERE)]
+    shades = [Relighting(boxes[0], nodes), Relighting(boxes[1], 2 * nodes)]
+    # after the first visit the light changes where it stands now, by a visit that moves something else
+    light = Relighting(move_out(SceneChange((moved(ball(THERE), BEYOND),)), 1.5).box, -nodes)
+    far = moved(Ball(at(0.0, 0.9, 0.25), 0.1), at(0.0, 1.2, 0.25))
+    once = UpdatedField(before, SceneChange((moved(ball(), THERE),)), shading=(shades[0],))
+    lit = UpdatedField(once, SceneChange((far,)), light=light)
+    twice = UpdatedField(lit, SceneChange((next_move(BEYOND),)), shading=(shades[1],))
+    (source,) = twice.sources
+    assert source is not None and source.field is before and len(source.lights) == 2
+    assert torch.allclose(source.now_from_then, THERE @ invert(HERE))
+    now = source_of(twice, grid_of(ball(BEYOND)))
+    assert now is not None and now.field is before and len(now.lights) == 3
+    x = BEYOND[:3, 3].float() + torch.randn(500, 3, generator=torch.Generator().manual_seed(1)) * 0.05
+    d = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(2)), dim=-1)
+    back = invert(now.now_from_then)
+    density, colour = twice(x, d)
+    expected, shown = now(transform(back, x), rotate(back, d))
+    assert torch.allclose(density, expected) and torch.allclose(colour, shown, atol=1e-4)
+    # one after the other: the light at each place where it stood, and then what turned it
+    at_there = transform(THERE @ invert(BEYOND), x)
+    _, was = lit(at_there, rotate(THERE @ invert(BEYOND), d))
+    assert torch.allclose(colour, shades[1].applied(at_there, was), atol=1e-3)
+    assert not torch.allclose(colour, was, atol=0.02)
+
+
+def test_what_a_helper_has_learnt_of_an_object_is_looked_up_there():
+    before, _ = first_visit()
+    came = UpdatedField(before, SceneChange((ObjectChange("added", grid_of(ball(BEYOND))),)), helper=before)
+    assert source_of(came, grid_of(ball(BEYOND))) is None
+    assert source_of(before, grid_of(ball())) is None
+    bare = Region((grid_of(Ball(THERE, 0.1)),))
+    part = UpdatedField(before, SceneChange((moved(ball(), THERE),)), helper=before, bare=bare)
+    assert source_of(part, grid_of(ball(THERE))) is None
 
 
 def test_a_move_that_is_taken_back_gives_the_old_pictures_back():

@@ -68,6 +68,8 @@ class Earlier:
 
 NOTHING_EARLIER = Earlier()
 _SOLID = 0.05  # opacity of a sample that was not empty before
+_NODES = 500  # of a grid, that are asked who answers for them
+_WHOLE = 0.8  # of them must be the same move's, for an object to be the one that it moved
 _PROBES = 8  # points a cell looked up when the sampler is recomputed: a moved surface crosses cells at any angle
 
 
@@ -307,22 +309,25 @@ class _Routed:
 
 
 def source_of(field: Field, grid: OccupancyGrid) -> Source | None:
-    """Where a field that has had updates looks up the object that ``grid`` holds; None if it does not move it, or has
-    learnt parts of it since."""
+    """Where a field that has had updates looks up the object that ``grid`` holds; None if it does not move it as a
+    whole, or has learnt parts of it since."""
     if not isinstance(field, UpdatedField):
         return None
-    centre = grid.tight_aabb().mean(0, keepdim=True)
-    to = field._route(centre, torch.zeros_like(centre))
-    i = int(to.owner[0])
-    if len(to.helper) or len(to.ground):
+    x = grid.occupied()
+    x = x[:: max(1, len(x) // _NODES)]
+    to = field._route(x, torch.zeros_like(x))
+    owner = to.owner.clone()
+    owner[to.helper] = owner[to.ground] = -2
+    i = int(owner.mode().values) if len(x) else -2
+    if i == -2 or float((owner == i).float().mean()) < _WHOLE:
         return None
-    if i < 0:
-        found = source_of(field.pretrained, grid)
-        light, pose = field.light, torch.eye(4, dtype=torch.float64)
+    still = torch.eye(4, dtype=torch.float64)
+    if i == -1:
+        found, light, pose = source_of(field.pretrained, grid), field.light, still
     else:
         if any(bool(inside_box(bare.aabb.mean(0), field.moves[i].box_now)) for bare in field.bare.grids):
             return None
-        found = field.sources[i] or Source(field.pretrained, torch.eye(4, dtype=torch.float64), field.outlooks[i])
+        found = field.sources[i] or Source(field.pretrained, still, field.outlooks[i])
         light, pose = field.shading[i] if i < len(field.shading) else None, field.moves[i].new_from_old
     if found is None:
         return None
