@@ -37,14 +37,14 @@ def test_round_trip(tmp_path, helped, lit):
     old, change = small_field(0), a_change()
     light, shading = (a_light(1), (a_light(2),)) if lit else (None, (None,))
     helper = small_field(3) if helped else None
-    field = UpdatedField(old, change, helper, light=light, shading=shading)
+    field = UpdatedField(old, change, helper, light=light, shading=shading).unshown(torch.tensor([1200, 2100]))
     save_updated(tmp_path, field)
     back = load_updated(tmp_path, old, change)
     x = torch.rand(3000, 3) * 2 - 1
     d = torch.nn.functional.normalize(torch.randn(3000, 3), dim=-1)
     for ours, theirs in zip(field(x, d), back(x, d)):
         assert torch.equal(ours, theirs)
-    assert torch.equal(field.sampler.grid, back.sampler.grid)
+    assert torch.equal(field.sampler.grid, back.sampler.grid) and torch.equal(field.unseen, back.unseen)
     rays = Rays(torch.tensor([[0.0, 0.0, -3.0]]).expand(200, 3), torch.nn.functional.normalize(-x[:200] + 3, dim=-1))
     assert torch.equal(render_rays(field, rays).rgb, render_rays(back, rays).rgb)
 

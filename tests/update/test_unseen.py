@@ -8,10 +8,11 @@ import torch
 from refield.field.radiance import Field, HashField, HashFieldConfig
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays
-from refield.update.composite import UpdatedField
+from refield.update.composite import Origin, UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.fit_helper import HelperTraining, Lit
 from refield.update.frozen import Segments
+from refield.update.recall import without
 from refield.update.region import move_out
 from refield.update.supervision import Lessons
 from refield.update.unseen import sight_of
@@ -61,6 +62,14 @@ def test_hidden_cells_are_not_shown_unless_something_new_answers_for_them() -> N
     assert updated.sampler.occupied(x).all()
     shown = updated.unshown(cells).sampler.occupied(x)
     assert shown.tolist() == [True, False] and updated.sampler.occupied(x).all()
+    # nor at later visits that look the cells up anew, nor when a move is taken back in a state that hides them
+    dark = updated.unshown(cells)
+    near = change_of(moved(Ball(at(0.0, 0.0, 0.3), 0.15), at(-2.0, 0.0, 0.0)))
+    later = UpdatedField(dark, near)
+    assert later.sampler.occupied(torch.tensor([[0.12, 0.12, 0.2], [-2.0, 0.0, 0.0]])).tolist() == [False, True]
+    back = without(later, Origin(0, 1, 0), departed=True)
+    assert isinstance(back, UpdatedField) and isinstance(back.pretrained, UpdatedField)
+    assert torch.equal(back.pretrained.unseen, dark.unseen)
 
 
 def test_a_helper_is_told_what_was_looked_through() -> None:

@@ -120,11 +120,15 @@ class UpdatedField:
         self.sources = tuple(source_of(pretrained, m.grid) for m in self.moves)
         self.sampler_step = pretrained.sampler.step
         self.boxes = tuple(m.box_now for m in self._shells) + region.boxes + earlier.places.boxes
-        if sampler is None:
-            sampler = pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES)
-        self.sampler = sampler
         self._base: HashField | None = _base_of(pretrained)
-        self._told = self._told_cells()
+        self._told = self._told_cells(pretrained.sampler)
+        self.unseen: Tensor = (
+            pretrained.unseen if isinstance(pretrained, UpdatedField) else torch.zeros(0, dtype=torch.long)
+        )
+        """flat indices of the sampler's cells that are not shown, see `unshown`"""
+        if sampler is None:
+            sampler = self._without_unseen(pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES))
+        self.sampler = sampler
         # a cell whose centre is just outside may hold a corner that is inside
         self._retold = functional.max_pool3d(self._told[None, None].float(), 3, 1, 1)[0, 0].to(torch.uint8)
         before = pretrained._marched if isinstance(pretrained, UpdatedField) else ()
@@ -137,11 +141,17 @@ class UpdatedField:
         return _part(self.change, self.skipped | {origin.object for origin in self.earlier.left})
 
     def unshown(self, cells: Tensor) -> UpdatedField:
-        """The same field, empty in those of its sampler's cells (flat indices) that nothing new answers for."""
-        out, grid = copy(self), self.sampler.grid.clone()
-        grid.view(-1)[cells] *= self._told.view(-1)[cells]
-        out.sampler = replace(self.sampler, grid=grid)
+        """The same field, empty in those of its sampler's cells (flat indices) that nothing new answers for; so are the
+        fields that later visits make of it."""
+        out = copy(self)
+        out.unseen = torch.cat([self.unseen, cells]).unique()
+        out.sampler = out._without_unseen(self.sampler)
         return out
+
+    def _without_unseen(self, sampler: OccupancySampler) -> OccupancySampler:
+        grid = sampler.grid.clone()
+        grid.view(-1)[self.unseen] *= self._told.view(-1)[self.unseen]
+        return replace(sampler, grid=grid)
 
     def samples(self, rays: Rays, jitter: bool = False) -> Samples:
         """Where to evaluate the field along rays; nothing behind the first opaque surface that never changed.
@@ -173,14 +183,14 @@ class UpdatedField:
         counts = near.new_zeros(len(rays)).index_copy(0, near, found.ray_offsets.diff())
         return Samples(found.t_starts, found.t_ends, torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
 
-    def _told_cells(self) -> Tensor:
+    def _told_cells(self, sampler: OccupancySampler) -> Tensor:
         """(R, R, R) uint8: cells whose centre is answered for by a move, a helper or nobody, at this visit or an
         earlier one."""
         earlier = self.pretrained._told if isinstance(self.pretrained, UpdatedField) else None
-        grid = torch.zeros_like(self.sampler.grid) if earlier is None else earlier.clone()
+        grid = torch.zeros_like(sampler.grid) if earlier is None else earlier.clone()
         for box in self.boxes:
-            cells = self.sampler.cells_in(box)
-            x = self.sampler.points_in(cells, jitter=False)
+            cells = sampler.cells_in(box)
+            x = sampler.points_in(cells, jitter=False)
             to = self._route(x, torch.zeros_like(x))
             told = to.owner >= 0
             told[to.helper] = True

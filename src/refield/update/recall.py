@@ -126,7 +126,8 @@ def _rebuilt(field: UpdatedField, inner: Field, **changed: object) -> UpdatedFie
         "untaught": field.untaught,
     } | changed
     change = parts.pop("change")
-    return UpdatedField(inner, change, field.helper, **parts)  # type: ignore[arg-type]
+    rebuilt = UpdatedField(inner, change, field.helper, **parts)  # type: ignore[arg-type]
+    return rebuilt.unshown(field.unseen)
 
 
 def _brought(field: Field, place: OccupancyGrid) -> tuple[int, int] | None:

@@ -39,6 +39,7 @@ def save_updated(folder: Path, field: UpdatedField) -> None:
         facts[name] = len(known.grids)
     facts["undone"] = [[o.object, o.layer, o.index] for o in field.earlier.undone]
     facts["left"] = [[o.object, o.layer, o.index] for o in field.earlier.left]
+    tensors["unseen"] = field.unseen
     if field.eyes is not None:
         tensors["eyes"] = field.eyes
     facts["shading"] = len(field.shading)
@@ -69,11 +70,14 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
         shading = tuple(_light_in(f"shading.{i}", tensors) for i in range(facts["shading"]))
         own = {name.removeprefix("helper."): t for name, t in tensors.items() if name.startswith("helper.")}
         helper = HashField.from_state(own, facts["helper"]) if facts["helper"] is not None else None
+        unseen = tensors["unseen"]
+        if not bool(((unseen >= 0) & (unseen < pretrained.sampler.grid.numel())).all()):
+            raise ValueError("a cell that is not shown is not one of the grid's")
         sampler = replace(pretrained.sampler, grid=tensors["occupancy"])
         base, earlier = _earlier_in(tensors, facts, pretrained)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(folder, f"does not describe an updated field ({error})", _REMEDY) from None
-    return UpdatedField(
+    updated = UpdatedField(
         base,
         change,
         helper,
@@ -85,6 +89,7 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
         sampler=sampler,
         earlier=earlier,
     )
+    return updated.unshown(unseen)
 
 
 def _earlier_in(tensors: dict[str, Tensor], facts: dict[str, Any], field: Field) -> tuple[Field, Earlier]:
