@@ -153,8 +153,10 @@ def _shown(field: Field, change: SceneChange) -> list[Tensor]:
 
 
 def _need_no_harm(change: SceneChange, before: Sequence[Tensor], after: Sequence[Tensor]) -> None:
-    """Raises:
-    InputError: the update shows the unchanged pixels of the new photos worse than the old field does.
+    """Refuse an update that shows the unchanged pixels of the new photos worse than the old field does.
+
+    Raises:
+        InputError: it does.
     """
     masks = [a | b for a, b in zip(change.masks_in, change.masks_out)]
     was, now = (untouched_psnr(shown, change.frames, masks) for shown in (before, after))

@@ -122,9 +122,8 @@ class UpdatedField:
         self.boxes = tuple(m.box_now for m in self._shells) + region.boxes + earlier.places.boxes
         self._base: HashField | None = _base_of(pretrained)
         self._told = self._told_cells(pretrained.sampler)
-        self.unseen: Tensor = (
-            pretrained.unseen if isinstance(pretrained, UpdatedField) else torch.zeros(0, dtype=torch.long)
-        )
+        none = pretrained.sampler.grid.new_zeros(0, dtype=torch.long)
+        self.unseen: Tensor = pretrained.unseen if isinstance(pretrained, UpdatedField) else none
         """flat indices of the sampler's cells that are not shown, see `unshown`"""
         if sampler is None:
             sampler = self._without_unseen(pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES))
