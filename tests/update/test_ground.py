@@ -29,10 +29,14 @@ def floor_points(count):
     return torch.cat([xy, 0.002 * torch.randn(count, 1)], 1)
 
 
+def grids_of(change):
+    return [o.grid for o in change.objects]
+
+
 def asked(change, x, planes, taken=()):
     """What `emptiness` says at world points (N, 3)."""
     cells = move_out(change, 1.5).sampler(0.02)
-    return emptiness(change, cells, Region(taken), footholds(change, planes))[cells.cells(x)]
+    return emptiness(change, cells, Region(taken), footholds(grids_of(change), planes))[cells.cells(x)]
 
 
 def test_the_floor_is_found_around_what_left():
@@ -71,14 +75,14 @@ def test_beneath_the_floor_is_nothing_either_the_less_so_the_nearer():
 
 
 def test_rays_enter_the_ground_where_the_object_stood_and_only_from_above():
-    (foothold,) = footholds(SceneChange((box_at(0.0),)), [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)])
+    (foothold,) = footholds([box_at(0.0).grid], [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)])
     down, level = [0.0, 0.6, -0.8], [0.0, 1.0, 0.0]
     rays = Rays(
         torch.tensor([[0.0, -0.75, 1.0], [0.0, 0.75, 1.0], [0.0, 0.0, 0.3], [0.0, 0.0, -1.0]]),
         torch.tensor([down, down, level, [0.0, 0.0, 1.0]]),
     )
     torch.testing.assert_close(foothold.entered(rays), torch.tensor([1.25] + 3 * [torch.inf]))
-    assert footholds(SceneChange((box_at(0.3),)), [foothold.plane]) == []
+    assert footholds([box_at(0.3).grid], [foothold.plane]) == []
     assert isinstance(foothold, Foothold) and foothold.holds(torch.tensor([[0.0, 0.0, -5.0]])).all()
 
 
@@ -89,10 +93,17 @@ def test_what_was_looked_through_is_empty_and_what_was_seen_beneath_the_floor_ma
     free, hidden, leg = cells.cells(x)
     empty = replace(cells, grid=torch.zeros_like(cells.grid))
     sight = Sight(empty, torch.stack([free, hidden, leg]), torch.tensor([3.0, -3.0, -1.0]))
-    found = emptiness(
-        SceneChange((box_at(0.0),)), cells, Region(()), footholds(SceneChange((box_at(0.0),)), planes), sight
-    )
+    found = emptiness(SceneChange((box_at(0.0),)), cells, Region(()), footholds([box_at(0.0).grid], planes), sight)
     assert found[free] == 1 and found[hidden] == 0.5 and found[leg] == 0
+
+
+def test_a_place_that_is_no_object_s_own_is_as_empty():
+    """What two places of an object shared, and only its second visit uncovers."""
+    planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]
+    x = torch.tensor([[0.0, 0.0, 0.2], [0.17, 0.0, 0.2], [0.0, 0.0, -0.09]])
+    cells = move_out(SceneChange((box_at(0.0),)), 1.5).sampler(0.02)
+    found = emptiness(SceneChange(()), cells, Region(()), footholds([box_at(0.0).grid], planes))[cells.cells(x)]
+    assert found.tolist() == [1.0, 0.5, 0.5]
 
 
 def test_a_plane_that_it_did_not_touch_says_nothing():

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from refield.scene.capture import Rays
-from refield.scene.change import OccupancyGrid, SceneChange
+from refield.scene.change import OccupancyGrid
 from refield.scene.planes import Plane, rough_planes
 
 _POINTS = 6000  # that planes are looked for among
@@ -25,16 +25,16 @@ def rim(grid: OccupancyGrid) -> float:
     return _RIM * float(grid.tight_aabb().diff(dim=0).mean())
 
 
-def footholds(change: SceneChange, planes: Sequence[Plane]) -> list[Foothold]:
-    """Where the objects that left, or moved, had touched planes."""
+def footholds(grids: Sequence[OccupancyGrid], planes: Sequence[Plane]) -> list[Foothold]:
+    """Where what stood in the grids, and left, had touched planes."""
     found: list[Foothold] = []
-    for o in change.objects:
-        occupied = o.grid.occupied().numpy()
-        if o.kind == "added" or not len(occupied):
+    for grid in grids:
+        occupied = grid.occupied().numpy()
+        if not len(occupied):
             continue
-        reach = rim(o.grid)
+        reach = rim(grid)
         touched = (p for p in planes if abs(float(np.quantile(p.height(occupied), 0.02))) < reach)
-        found += [Foothold(p, o.grid, reach) for p in touched]
+        found += [Foothold(p, grid, reach) for p in touched]
     return found
 
 

@@ -71,16 +71,16 @@ def emptiness(
     depth = torch.zeros(r**3)
     cell = 4 * cells.contraction.radius / r
     centres = cells.points_in(torch.arange(r**3), jitter=False)
-    for o in change.objects:
-        if o.kind == "added":
-            continue
-        inside = o.grid.contains(centres).reshape(r, r, r)
+    left = [o.grid for o in change.objects if o.kind != "added"]
+    left += [f.grid for f in ground if all(f.grid is not g for g in left)]
+    for grid in left:
+        inside = grid.contains(centres).reshape(r, r, r)
         if not inside.any():
             continue
-        reach = rim(o.grid)
+        reach = rim(grid)
         distance = torch.from_numpy(distance_transform_edt(inside.numpy())).float().reshape(-1) * cell
         depth = torch.maximum(depth, (distance / reach - 1).clamp(0, 1))
-        above = [f.plane.height(centres.numpy()) > _band(f, cell) for f in ground if f.grid is o.grid]
+        above = [f.plane.height(centres.numpy()) > _band(f, cell) for f in ground if f.grid is grid]
         if above:
             free = inside.reshape(-1) & torch.from_numpy(np.logical_and.reduce(above))
             depth[free] = depth[free].clamp_min(_RIM)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from refield.artefacts import read_tensors, write_tensors
@@ -70,7 +71,7 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
         shading = tuple(_light_in(f"shading.{i}", tensors) for i in range(facts["shading"]))
         own = {name.removeprefix("helper."): t for name, t in tensors.items() if name.startswith("helper.")}
         helper = HashField.from_state(own, facts["helper"]) if facts["helper"] is not None else None
-        unseen = tensors["unseen"]
+        unseen = tensors.get("unseen", torch.zeros(0, dtype=torch.long))  # of older visits it is not known
         if not bool(((unseen >= 0) & (unseen < pretrained.sampler.grid.numel())).all()):
             raise ValueError("a cell that is not shown is not one of the grid's")
         sampler = replace(pretrained.sampler, grid=tensors["occupancy"])

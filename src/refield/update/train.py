@@ -38,6 +38,7 @@ DEFAULTS = UpdateConfig()
 _PATCHES, _FOLDS, _SHADING_CELLS = 8, 4, 24  # an object's side in patches that are left out together; in cells
 _LIT_RAYS = 60_000  # of the new photos; a lattice of factors is no finer than they show
 _MADE = 20  # of the old photos that an earlier visit put out of date; each takes longer to put right than to learn from
+_GROUND_RAYS = 12_000  # that planes are looked for along
 _RING_RAYS = 40_000  # of the old photos; more add time and nothing to learn
 
 
@@ -92,18 +93,13 @@ def update_field(
     step = step_near(field, middle)
     region = _in_reach(wide.sampler(step), capture.train + change.frames)
     # what earlier visits know has been taken from them already; of the rest no old photo shows anything
-    old, ground = known.sparse[:0], list[Foothold]()
-    if cut.to_learn.objects:
-        old, depth = _old_lessons(capture, cut, region, config, light)
-        around = old.rays.origins + old.rays.directions * depth[:, None]
-        planes = planes_around(around, wide.box, eyes, max(_pixel(change, middle), step))
-        ground = footholds(cut.to_learn, planes)
+    old = _old_lessons(capture, cut, region, config, light) if cut.to_learn.objects else known.sparse[:0]
+    ground = _ground(known, old, wide, eyes, max(_pixel(change, middle), step))
     sparse = known.sparse[meets(region, known.sparse.rays).nonzero()[:, 0]]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
     say("freeze")
-    beside = [torch.stack([2 * b[0] - b[1], 2 * b[1] - b[0]]) for b in wide.boxes]
-    sight = sight_of(cut.pretrained, capture.train, beside)
+    sight = sight_of(cut.pretrained, capture.train, _beside(wide))
     frozen = lit(region=wide).unshown(sight.hidden)
     new_taught, judge = _split(Lit(sparse, _fixed(frozen, region, sparse.rays, ground)), config.held_out)
     old_taught = Lit(old, _fixed(frozen, region, old.rays, ground))
@@ -220,8 +216,8 @@ def _shading(sparse: Lessons, cut: UpdatedField, change: SceneChange) -> tuple[R
 
 def _old_lessons(
     capture: Capture, cut: UpdatedField, region: OccupancySampler, config: UpdateConfig, light: Relighting | None
-) -> tuple[Lessons, Tensor]:
-    """Ring pixels of the old photos whose rays meet the region, in the new light, and the depth (N,) they show."""
+) -> Lessons:
+    """Ring pixels of the old photos whose rays meet the region, in the new light."""
     asked = _asked(capture.train)
     bank, places = PixelBank([capture.train[i] for i in asked]), places_of(cut.change)
     chosen = []
@@ -233,10 +229,31 @@ def _old_lessons(
     pixels = pixels[meets(region, bank.rays(pixels)).nonzero()[:, 0]]
     pixels = pixels[torch.randperm(len(pixels))[:_RING_RAYS]].sort().values
     rays, rgb = bank.rays(pixels), bank.colours(pixels)
-    was = render_many(cut.pretrained, rays)
     if light is not None:
+        was = render_many(cut.pretrained, rays)
         rgb = light.applied(rays.origins + rays.directions * was.depth[:, None], rgb)
-    return Lessons(rays, rgb, torch.full((len(rgb),), -1)), was.depth
+    return Lessons(rays, rgb, torch.full((len(rgb),), -1))
+
+
+def _beside(region: Region) -> list[Tensor]:
+    """World boxes (2, 3) three times as large as the region's."""
+    return [torch.stack([2 * b[0] - b[1], 2 * b[1] - b[0]]) for b in region.boxes]
+
+
+def _ground(known: _Known, old: Lessons, wide: Region, eyes: Tensor, resolved: float) -> list[Foothold]:
+    """What stood on planes where something is to be learnt: the objects that left, and what is left to learn of places
+    that earlier visits know. The planes are looked for along the rays of the old photos that teach, else along those of
+    the new ones that pass nearby."""
+    cut, shown, rays = known.cut, known.cut.pretrained, old.rays
+    if len(rays) == 0:
+        near = torch.stack([leaving(known.sparse.rays, b) for b in _beside(wide)]).amax(0) > 0
+        shown, rays = cut, known.sparse.rays[near.nonzero()[:, 0]]
+    rays = rays[torch.randperm(len(rays))[:_GROUND_RAYS]]
+    points = rays.origins + rays.directions * render_many(shown, rays).depth[:, None]
+    planes = planes_around(points, wide.box, eyes, resolved)
+    return footholds(
+        [o.grid for o in cut.to_learn.objects if o.kind != "added"] + list(cut.earlier.unknown.grids), planes
+    )
 
 
 def _asked(frames: Sequence[Frame]) -> list[int]:
