@@ -97,7 +97,7 @@ class _Retouched:
         frame = self.frame
         image = frame_image(frame).float() / 255
         part = min(max(1 / _COARSE, _LEAST / min(frame.camera.width, frame.camera.height)), 1.0)
-        coarse = self._differs(frame.camera.shrunk(part))
+        coarse, _ = self._differs(frame.camera.shrunk(part))
         mask = functional.interpolate(coarse[None, None], image.shape[:2])[0, 0] > 0.5
         if mask.any():
             rays = camera_rays(frame.camera, frame.world_from_cam)
@@ -107,17 +107,23 @@ class _Retouched:
     def at(self, camera: Camera, now: Tensor) -> Tensor:
         """See `Made`."""
         image = scaled_image(self.frame, camera)
-        return torch.where(self._differs(camera, now)[..., None] > 0.5, now, image)
+        mask, was = self._differs(camera, now)
+        # not a picture without error: what the field gets wrong in photos is learnt from these
+        put_right = (now + image - was).clamp(0, 1)
+        return torch.where(mask[..., None] > 0.5, put_right, image)
 
-    def _differs(self, camera: Camera, now: Tensor | None = None) -> Tensor:
-        """(H, W) float32, 1 where the two states look different from the frame's place, with a margin of a pixel."""
+    def _differs(self, camera: Camera, now: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """(H, W) float32, 1 where the two states look different from the frame's place, with a margin of a pixel. And
+        what the first of them shows, (H, W, 3), or ``now`` where no ray meets what changed."""
         rays = camera_rays(camera, self.frame.world_from_cam)
         near = torch.stack([leaving(rays, box) for box in self.changed]).amax(0) > 0
-        was, now = render_many(self.states[0], rays[near]).rgb, None if now is None else now.reshape(-1, 3)[near]
-        now = render_many(self.states[1], rays[near]).rgb if now is None else now
+        shown = render_many(self.states[0], rays[near]).rgb
+        late = render_many(self.states[1], rays[near]).rgb if now is None else now.reshape(-1, 3)[near]
         mask = torch.zeros(1, 1, camera.height, camera.width)
-        mask.view(-1)[near] = ((was - now).abs().amax(-1) > _SHOWS).float()
-        return functional.max_pool2d(mask, 3, stride=1, padding=1)[0, 0]
+        mask.view(-1)[near] = ((shown - late).abs().amax(-1) > _SHOWS).float()
+        was = torch.zeros(camera.height, camera.width, 3) if now is None else now.clone()
+        was.view(-1, 3)[near] = shown
+        return functional.max_pool2d(mask, 3, stride=1, padding=1)[0, 0], was
 
 
 def _changed_boxes(now: Field) -> list[Tensor]:

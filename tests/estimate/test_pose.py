@@ -21,14 +21,18 @@ from refield.estimate.layers import Sight, layers_at
 from refield.estimate.look import Hidden, see, shaded
 from refield.estimate.matched import camera_from_object, matched_poses
 from refield.estimate.models import Models
+from refield.estimate.outline import ObjectConfig, remembered
 from refield.estimate.past import changed_share, gone_score, look_past
 from refield.estimate.pose_change import RefineConfig, refine, residuals
 from refield.estimate.register import Target, register, super_fibonacci, turns_about
 from refield.field.render import render_camera
+from refield.field.source import Known
 from refield.scene.camera import Camera
 from refield.scene.capture import Rays, camera_rays
+from refield.scene.change import ObjectChange, SceneChange
 from refield.scene.planes import Plane
 from refield.scene.pose import angle_between, invert, transform
+from refield.update.composite import UpdatedField, source_of
 from refield.vision.matcher import SiftMatcher
 from tests.estimate.boxes import BoxWorld, camera_at, capture_of, new_photos, standing, turn
 
@@ -257,3 +261,27 @@ def test_detail_of_old_photos_is_what_the_field_lacks(stage):
     lacks, true = lacks - lacks.mean(0), true - true.mean(0)
     assert float((lacks * true).sum() / (lacks.norm() * true.norm())) > 0.8
     assert detail_of(plain, stage.old, [], views, TRUE, 3, 80_000).patches == ()
+
+
+def test_an_object_that_moved_before_is_looked_up_where_it_first_was(stage):
+    grid = stage.old.shape
+    eyes = torch.stack([f.centre for f in stage.capture.frames]).float()
+    once = UpdatedField(BEFORE, SceneChange((ObjectChange("moved", grid, TRUE),)), eyes=eyes)
+    there = grid.moved(TRUE)
+    source = source_of(once, there)
+    assert source is not None and source.field is BEFORE
+    layered, sourced = (
+        remembered(once, stage.capture.frames, Known(there, s), (), ObjectConfig()) for s in (None, source)
+    )
+    assert layered.source is None and sourced.source is source
+    on = turn(transform(TRUE, CRATE.world_from_box[:3, 3]), -110, (-0.5, 0.1, 0))
+    view = stage.past[0].view
+    rays = camera_rays(view.camera, view.frame.world_from_cam)
+    truth = see(BoxWorld((CRATE.moved(on @ TRUE),)), rays)
+    shown = [object_alone(once, old, rays, on) for old in (layered, sourced)]
+    solid = (shown[0].opacity > 0.9) & (shown[1].opacity > 0.9)
+    either = (shown[0].opacity > 0.5) | (shown[1].opacity > 0.5)
+    assert int(solid.sum()) > 300 and float(solid.sum()) > 0.8 * float(either.sum())
+    off = [(s.rgb - truth.rgb)[solid].abs().amax(-1) for s in shown]
+    assert float(off[1].median()) < 0.02 and float(off[1].mean()) < float(off[0].mean()) + 0.01
+    assert float((shown[1].depth - truth.depth)[solid].abs().median()) < 0.02

@@ -38,7 +38,7 @@ def test_segments_alone_are_the_rendering() -> None:
 def test_weaving_a_helper_in_is_rendering_the_updated_field() -> None:
     rays = views()
     helper = BallWorld((Ball(NEW_POSE, 0.25),))
-    region = WIDE.sampler(STEP, resolution=192)
+    region = WIDE.sampler(STEP)
     fixed = composite_once(FROZEN, region, rays)
     samples = region(rays)
     x, d = samples.positions(rays)

@@ -7,7 +7,7 @@ import torch
 
 from refield.field.render import render_rays
 from refield.scene.capture import Rays
-from refield.scene.change import ObjectChange, SceneChange
+from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.pose import invert, rotate, transform
 from refield.update.composite import Origin, UpdatedField, source_of
 from refield.update.light import Relighting
@@ -79,6 +79,22 @@ def test_however_often_it_moved_it_is_looked_up_where_it_first_was():
     assert not torch.allclose(colour, was, atol=0.02)
 
 
+def test_what_it_takes_along_that_it_never_had_before_is_not_looked_up_there():
+    low, high = ball(THERE), Ball(at(0.4, 0.3, 0.58), 0.08)  # another thing, on top of it
+    before = BallWorld((ball(), high))
+    once = UpdatedField(before, SceneChange((moved(ball(), THERE),)), helper=before)
+    both = OccupancyGrid(torch.tensor([[0.1, 0.0, -0.05], [0.7, 0.6, 0.7]]), torch.zeros(31, 31, 38))
+    held = [grid_of(b).contains(both.nodes()) for b in (low, high)]
+    change = SceneChange(
+        (ObjectChange("moved", replace(both, values=(held[0] | held[1]).float()), BEYOND @ invert(THERE)),)
+    )
+    twice = UpdatedField(once, change)
+    assert twice.sources[0] is not None
+    centres = torch.stack([low.world_from_ball[:3, 3], high.world_from_ball[:3, 3]])
+    now = transform(BEYOND @ invert(THERE), centres).float()
+    assert (twice.density(now) > 100).all()
+
+
 def test_what_a_helper_has_learnt_of_an_object_is_looked_up_there():
     before, _ = first_visit()
     came = UpdatedField(before, SceneChange((ObjectChange("added", grid_of(ball(BEYOND))),)), helper=before)
@@ -87,6 +103,20 @@ def test_what_a_helper_has_learnt_of_an_object_is_looked_up_there():
     bare = Region((grid_of(Ball(THERE, 0.1)),))
     part = UpdatedField(before, SceneChange((moved(ball(), THERE),)), helper=before, bare=bare)
     assert source_of(part, grid_of(ball(THERE))) is None
+
+
+def test_what_was_not_shown_is_not_shown_when_the_object_leaves_again():
+    _, now = first_visit()
+    beside = THERE[:3, 3].float() + torch.tensor([0.15, 0.0, -0.29])  # in the floor
+    cell = now.sampler.cells(beside)[None]
+    assert now.sampler.occupied(beside)
+    dark = now.unshown(cell)
+    assert not dark.sampler.occupied(beside)
+    change = SceneChange((next_move(BEYOND),))
+    for state, shown in ((now, True), (dark, False)):
+        base, earlier = earlier_of(state, change, 1.5)
+        assert earlier.places.contains(beside[None]).all()
+        assert bool(UpdatedField(base, change, earlier=earlier).sampler.occupied(beside)) == shown
 
 
 def test_a_move_that_is_taken_back_gives_the_old_pictures_back():

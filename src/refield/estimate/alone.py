@@ -47,7 +47,8 @@ def object_alone(
     end = float(far[hit].max()) / sampler.contraction.radius  # beyond it there is nothing to look for
     samples = replace(sampler, far=min(end, sampler.far))(there)
     x, d = samples.positions(there)
-    keep = grid.contains(x).nonzero()[:, 0]
+    own = grid.contains(x) if old.source is None else grid.contains(x) & old.source.grid.contains(x)
+    keep = own.nonzero()[:, 0]
     at, left = (x[keep], d[keep]), samples.only(keep)
     with torch.no_grad():
         if old.source is None:

@@ -191,9 +191,11 @@ def _place_all(
         fits: dict[int, Fit] = {}
         # what moved before moves again: a piece of something else is tried only on what that leaves unexplained
         for again in (True, False):
-            some = [k for k, old in tried if old.remembered == again and k not in moved and parts and not fits]
+            some = [k for k, old in tried if old.remembered == again and k not in moved and parts]
             tries = {k: best_fit(ground, olds[k], everyone, views, parts, guess(k)) for k in some}
             fits |= {k: fit for k, fit in tries.items() if fit is not None}
+            if any(fit.change.explained >= ground.believe.shown for fit in fits.values()):
+                break
         if not fits:
             return moved, views, olds
         for k in _together(fits, ground.search.enough):

@@ -23,11 +23,13 @@ class Light(Protocol):
 
 @dataclass(frozen=True)
 class Source:
-    """A Field of the place where an object first was, in the light in which it is now; the rest of it is not to be
-    asked."""
+    """A Field of the place where an object first was, in the light in which it is now; not to be asked outside of its
+    grid."""
 
     field: Field
     """holds the object"""
+    grid: OccupancyGrid
+    """the object there, with the skin that it takes along"""
     now_from_then: Tensor
     """(4, 4) float64, all its moves since"""
     outlook: Outlook | None

@@ -24,8 +24,8 @@ class Made(Protocol):
         """Write it."""
 
     def at(self, camera: Camera, now: Tensor) -> Tensor:
-        """The photo (H, W, 3) float32 in [0, 1] as its ``camera``, scaled down, takes it; nothing is written. ``now``,
-        of the same shape, is what the scene's field shows there."""
+        """The photo (H, W, 3) float32 in [0, 1] as its ``camera``, scaled down, would have taken it; nothing is
+        written. ``now``, of the same shape, is what the scene's field shows there; as in a photo, not all is so."""
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class OccupancyGrid:
     def met_by(self, rays: Rays, places: int = 40) -> Tensor:
         """Whether each of N rays passes through the object, at one of so many places on its way, (N,) bool."""
         tight = self.tight_aabb()
-        return meet_grid((rays.origins, rays.directions), self.aabb, self.values, 0.5, tight, places)
+        return meet_grid(rays, self.aabb, self.values, 0.5, tight, places)
 
     def nodes(self) -> Tensor:
         """World positions of the nodes, (X, Y, Z, 3) float32."""

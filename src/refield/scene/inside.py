@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from refield.scene.capture import Rays
+
 _Array = NDArray[Any]
 _JIT: dict[str, Any] = {"cache": True, "error_model": "numpy"}
 
@@ -37,21 +39,18 @@ def in_grid(x: Tensor, aabb: Tensor, values: Tensor, level: float) -> Tensor:
     if x.device.type != "cpu":
         return trilinear(x, aabb, values) > level
     out = torch.empty(len(x), dtype=torch.bool)
-    # the lattice's own precision, float32, would put points of a float64 world a grid's rounding off
     _in_grid(x.detach().numpy(), aabb.detach().to(x.dtype).numpy(), values.detach().numpy(), level, out.numpy())
     return out
 
 
-def meet_grid(
-    rays: tuple[Tensor, Tensor], aabb: Tensor, values: Tensor, level: float, tight: Tensor, places: int
-) -> Tensor:
-    """Origins and directions (N, 3) of rays -> whether each passes, at one of ``places`` places along its way through
+def meet_grid(rays: Rays, aabb: Tensor, values: Tensor, level: float, tight: Tensor, places: int) -> Tensor:
+    """N rays -> whether each passes, at one of ``places`` places along its way through
     the box ``tight`` (2, 3), where the trilinear value is above ``level``, (N,) bool on the CPU. See `in_grid`."""
-    out = torch.empty(len(rays[0]), dtype=torch.bool)
+    out = torch.empty(len(rays), dtype=torch.bool)
     origins, directions, box, nodes, within = (
-        t.detach().cpu().numpy() for t in (*rays, aabb.double(), values, tight.double())
+        t.detach().cpu().numpy() for t in (rays.origins, rays.directions, aabb.double(), values, tight.double())
     )
-    _meet_grid((origins, directions), box, nodes, level, within, places, out.numpy())
+    _meet_grid(origins, directions, box, nodes, level, within, places, out.numpy())
     return out
 
 
@@ -111,9 +110,15 @@ def _in_grid(x: _Array, aabb: _Array, values: _Array, level: float, out: _Array)
 
 @njit(parallel=True, **_JIT)
 def _meet_grid(
-    rays: tuple[_Array, _Array], aabb: _Array, values: _Array, level: float, tight: _Array, places: int, out: _Array
+    origins: _Array,
+    directions: _Array,
+    aabb: _Array,
+    values: _Array,
+    level: float,
+    tight: _Array,
+    places: int,
+    out: _Array,
 ) -> None:
-    origins, directions = rays
     for n in prange(len(origins)):
         near, far = 0.0, np.inf
         for axis in range(3):

@@ -11,10 +11,11 @@ from torch.nn import functional
 
 from refield.field.radiance import Field
 from refield.field.render import visible_samples
+from refield.field.source import Source
 from refield.field.warp import Move, outline
 from refield.scene.capture import Frame, Rays, centres
 from refield.scene.change import OccupancyGrid, SceneChange
-from refield.scene.pose import transform
+from refield.scene.pose import invert, transform
 from refield.update.composite import UpdatedField
 from refield.update.region import Region
 
@@ -30,15 +31,21 @@ def bare_skin(cut: UpdatedField, old: tuple[Frame, ...], change: SceneChange) ->
     ``cut`` is the old field with the objects moved.
     """
     spread = old[:: max(1, len(old) // _EYES)]
-    grids = [_of_one(cut, move, centres(spread).float(), centres(change.frames).float()) for move in cut.moves]
+    eyes = centres(spread).float(), centres(change.frames).float()
+    grids = [_of_one(cut, move, source, *eyes) for move, source in zip(cut.moves, cut.sources)]
     return Region(tuple(g for g in grids if g is not None))
 
 
-def _of_one(cut: UpdatedField, move: Move, old_eyes: Tensor, new_eyes: Tensor) -> OccupancyGrid | None:
+def _of_one(
+    cut: UpdatedField, move: Move, source: Source | None, old_eyes: Tensor, new_eyes: Tensor
+) -> OccupancyGrid | None:
     step = cut.sampler.step
     lattice, outer = _outer_nodes(move.grid, step)
     x = lattice.nodes()[outer]
-    unseen = ~_seen_by(cut.pretrained, old_eyes, x, step)
+    if source is None:
+        unseen = ~_seen_by(cut.pretrained, old_eyes, x, step)
+    else:  # the photos showed it where it stood when they were taken
+        unseen = ~_seen_by(source.field, old_eyes, transform(invert(source.now_from_then), x), step)
     shown = torch.zeros_like(unseen)
     if unseen.any():
         shown[unseen] = _seen_by(cut, new_eyes, transform(move.new_from_old, x[unseen]), step)

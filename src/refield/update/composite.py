@@ -121,7 +121,7 @@ class UpdatedField:
         self.sampler_step = pretrained.sampler.step
         self.boxes = tuple(m.box_now for m in self._shells) + region.boxes + earlier.places.boxes
         self._base: HashField | None = _base_of(pretrained)
-        self._told = self._told_cells(pretrained.sampler)
+        self._told, self._nothing = self._told_cells(pretrained.sampler)
         none = pretrained.sampler.grid.new_zeros(0, dtype=torch.long)
         self.unseen: Tensor = pretrained.unseen if isinstance(pretrained, UpdatedField) else none
         """flat indices of the sampler's cells that are not shown, see `unshown`"""
@@ -150,6 +150,7 @@ class UpdatedField:
     def _without_unseen(self, sampler: OccupancySampler) -> OccupancySampler:
         grid = sampler.grid.clone()
         grid.view(-1)[self.unseen] *= self._told.view(-1)[self.unseen]
+        grid.view(-1)[self._nothing] = 0
         return replace(sampler, grid=grid)
 
     def samples(self, rays: Rays, jitter: bool = False) -> Samples:
@@ -182,28 +183,31 @@ class UpdatedField:
         counts = near.new_zeros(len(rays)).index_copy(0, near, found.ray_offsets.diff())
         return Samples(found.t_starts, found.t_ends, torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
 
-    def _told_cells(self, sampler: OccupancySampler) -> Tensor:
+    def _told_cells(self, sampler: OccupancySampler) -> tuple[Tensor, Tensor]:
         """(R, R, R) uint8: cells whose centre is answered for by a move, a helper or nobody, at this visit or an
-        earlier one."""
+        earlier one. And those (flat indices) in which the state that knows an earlier place shows nothing."""
+        empty = [sampler.grid.new_zeros(0, dtype=torch.long)]
         earlier = self.pretrained._told if isinstance(self.pretrained, UpdatedField) else None
         grid = torch.zeros_like(sampler.grid) if earlier is None else earlier.clone()
         for box in self.boxes:
             cells = sampler.cells_in(box)
             x = sampler.points_in(cells, jitter=False)
-            to = self._route(x, torch.zeros_like(x))
+            to = self._route(x)
             told = to.owner >= 0
             told[to.helper] = True
             told[to.ground] = True
             grid.view(-1)[cells[told]] = 1
-        return grid
+            if self.earlier.ground is not None:
+                empty.append(cells[to.ground[~self.earlier.ground.sampler.occupied(x[to.ground])]])
+        return grid, torch.cat(empty).unique()
 
     def density(self, x: Tensor) -> Tensor:
         """World points (..., 3) -> sigma (...,), per world unit."""
         flat = x.reshape(-1, 3)
-        to = self._route(flat, torch.zeros_like(flat))
+        to = self._route(flat)
         sigma = flat.new_zeros(len(flat)).index_copy(0, to.old, self.pretrained.density(to.asked[to.old]))
-        for i, rows in to.sourced:
-            sigma = sigma.index_copy(0, rows, self.source(i).density(self._then(i, to.asked[rows])))
+        for found in to.sourced:
+            sigma = sigma.index_copy(0, found.rows, found.source.density(found.x))
         for field, rows in ((self.helper, to.helper), (self.earlier.ground, to.ground)):
             if field is not None and len(rows):
                 sigma = sigma.index_copy(0, rows, field.density(flat[rows]))
@@ -217,9 +221,9 @@ class UpdatedField:
         c = self._relit(to.asked[to.old], c, to.owner[to.old])
         sigma = flat.new_zeros(len(flat)).index_copy(0, to.old, s)
         rgb = torch.zeros_like(flat).index_copy(0, to.old, c)
-        for i, rows in to.sourced:
-            source = self.source(i)
-            s, c = source(self._then(i, to.asked[rows]), rotate(invert(source.now_from_then), to.turned[rows]))
+        for found in to.sourced:
+            rows, then = found.rows, invert(found.source.now_from_then)
+            s, c = found.source(found.x, rotate(then, to.turned[rows]))
             c = self._relit(to.asked[rows], c, to.owner[rows])
             sigma, rgb = sigma.index_copy(0, rows, s), rgb.index_copy(0, rows, c)
         if self.helper is not None and len(to.helper):
@@ -231,8 +235,10 @@ class UpdatedField:
             sigma, rgb = sigma.index_copy(0, to.ground, s), rgb.index_copy(0, to.ground, c)
         return sigma.reshape(x.shape[:-1]), rgb.reshape(x.shape)
 
-    def _route(self, x: Tensor, d: Tensor) -> _Routed:
-        """Who answers for world points (S, 3) and directions (S, 3)."""
+    def _route(self, x: Tensor, d: Tensor | None = None) -> _Routed:
+        """Who answers for world points (S, 3) and directions (S, 3); which, where only densities are asked for, may be
+        left out."""
+        held, d = d is not None, torch.zeros_like(x) if d is None else d
         owner = torch.full(x.shape[:1], -1, dtype=torch.long, device=x.device)
         near = self._near(x.detach()).nonzero()[:, 0]
         if len(near) == 0:
@@ -248,25 +254,18 @@ class UpdatedField:
         for i, (outlook, source) in enumerate(zip(self.outlooks, self.sources)):
             mine = (mover == i).nonzero()[:, 0]
             if source is not None:
-                sourced.append((i, near[mine]))
-            elif outlook is not None:
+                then = transform(invert(source.now_from_then), at[mine])
+                held_there = source.grid.contains(then)
+                sourced.append(_Sourced(source, near[mine[held_there]], then[held_there]))
+                mine = mine[~held_there]
+            if held and outlook is not None:
                 along = along.index_copy(0, mine, outlook.held(at[mine], along[mine]))
         asked, turned = x.index_copy(0, near, at), d.index_copy(0, near, along)
         old = torch.ones(len(x), dtype=torch.bool, device=x.device)
         old[near] = ~(helped | grounded)
-        for _, rows in sourced:
-            old[rows] = False
+        for found in sourced:
+            old[found.rows] = False
         return _Routed(asked, turned, owner, old.nonzero()[:, 0], near[helped], near[grounded], tuple(sourced))
-
-    def source(self, i: int) -> Source:
-        """Of a move that has one."""
-        source = self.sources[i]
-        assert source is not None
-        return source
-
-    def _then(self, i: int, x: Tensor) -> Tensor:
-        """Where its source has what was at points (S, 3) before a move."""
-        return transform(invert(self.source(i).now_from_then), x)
 
     def arrived(self, x: Tensor) -> Tensor:
         """Which move each world point (S, 3) is answered by, (S,) int64, -1 for none.
@@ -298,6 +297,17 @@ class UpdatedField:
 
 
 @dataclass(frozen=True)
+class _Sourced:
+    """Points that an object's source answers for."""
+
+    source: Source
+    rows: Tensor
+    """(K,) int64"""
+    x: Tensor
+    """(K, 3) where the source has them"""
+
+
+@dataclass(frozen=True)
 class _Routed:
     """Who answers for S points."""
 
@@ -313,8 +323,8 @@ class _Routed:
     """rows of the helper; of nobody where there is none"""
     ground: Tensor
     """rows of the earlier state that knows the place"""
-    sourced: tuple[tuple[int, Tensor], ...]
-    """moves that have a source, and the rows that it answers for"""
+    sourced: tuple[_Sourced, ...]
+    """what moved before, and is looked up where it first was"""
 
 
 def source_of(field: Field, grid: OccupancyGrid) -> Source | None:
@@ -324,7 +334,7 @@ def source_of(field: Field, grid: OccupancyGrid) -> Source | None:
         return None
     x = grid.occupied()
     x = x[:: max(1, len(x) // _NODES)]
-    to = field._route(x, torch.zeros_like(x))
+    to = field._route(x)
     owner = to.owner.clone()
     owner[to.helper] = owner[to.ground] = -2
     i = int(owner.mode().values) if len(x) else -2
@@ -336,7 +346,7 @@ def source_of(field: Field, grid: OccupancyGrid) -> Source | None:
     else:
         if any(bool(inside_box(bare.aabb.mean(0), field.moves[i].box_now)) for bare in field.bare.grids):
             return None
-        found = field.sources[i] or Source(field.pretrained, still, field.outlooks[i])
+        found = field.sources[i] or Source(field.pretrained, field._shells[i].grid, still, field.outlooks[i])
         light, pose = field.shading[i] if i < len(field.shading) else None, field.moves[i].new_from_old
     if found is None:
         return None

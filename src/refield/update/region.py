@@ -46,15 +46,14 @@ class Region:
                 found[near] = grid.contains(flat[near])
         return found.reshape(x.shape[:-1])
 
-    def sampler(self, step: float, resolution: int | None = None) -> OccupancySampler:
+    def sampler(self, step: float) -> OccupancySampler:
         """Looks everywhere in the region and nowhere else; its core cube is the region's bounding cube.
 
-        Its cells are as wide as a sample is long, within what memory affords, unless ``resolution`` is given.
+        Its cells are as wide as a sample is long, within what memory affords.
         """
         box = self.box
         space = Contraction(box.mean(0), float((box[1] - box[0]).max()) / 2 * 1.02)
-        if resolution is None:
-            resolution = int(min(max(4 * space.radius / step, 64), 160))
+        resolution = int(min(max(4 * space.radius / step, 64), 160))
         empty = OccupancySampler(space, torch.zeros(resolution, resolution, resolution, dtype=torch.uint8), step)
         cells = empty.cells_in(box)
         grid = empty.grid.clone()

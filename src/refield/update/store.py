@@ -72,7 +72,7 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
         own = {name.removeprefix("helper."): t for name, t in tensors.items() if name.startswith("helper.")}
         helper = HashField.from_state(own, facts["helper"]) if facts["helper"] is not None else None
         unseen = tensors.get("unseen", torch.zeros(0, dtype=torch.long))  # of older visits it is not known
-        if not bool(((unseen >= 0) & (unseen < pretrained.sampler.grid.numel())).all()):
+        if unseen.dtype != torch.long or not bool(((unseen >= 0) & (unseen < pretrained.sampler.grid.numel())).all()):
             raise ValueError("a cell that is not shown is not one of the grid's")
         sampler = replace(pretrained.sampler, grid=tensors["occupancy"])
         base, earlier = _earlier_in(tensors, facts, pretrained)
