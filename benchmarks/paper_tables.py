@@ -115,10 +115,8 @@ def _one(lab: Lab, case: Case, method: str) -> str:
 
 
 def _lab(options: argparse.Namespace) -> Lab:
-    usual = (FitConfig.steps, UpdateConfig.steps) == (options.steps, options.update_steps)
-    other = "" if usual else f"steps_{options.steps}_{options.update_steps}"  # never mixed with the usual ones
     return Lab(
-        Kept(options.out / other),
+        Kept(options.out / f"steps_{options.steps}_{options.update_steps}"),  # never mixed with others
         FitConfig(steps=options.steps),
         UpdateConfig(steps=options.update_steps, max_seconds=600.0),  # a busy machine must not change what is found
         None if options.lpips is None else open_lpips(options.lpips),

@@ -116,7 +116,7 @@ def test_what_was_found_is_shown(
 ) -> None:
     script, cases = tables("paper_tables"), tables("tables.cases")
     mine, docs = folder(tmp_path / "mine"), tmp_path / "docs" / "results.md"
-    results(tmp_path / "out", "mine")
+    results(tmp_path / "out" / f"steps_{script.FitConfig.steps}_{script.UpdateConfig.steps}", "mine")
     monkeypatch.setattr(cases.Case, "frames", write_capture(tmp_path / "new", 2).frames)
     docs.parent.mkdir()
     docs.write_text("# Results\n\nOther figures.\n")

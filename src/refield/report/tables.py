@@ -61,14 +61,15 @@ def _object_row(index: int, o: ObjectChange, world: World | None) -> str:
     if o.new_from_old is not None and shift is not None:
         angle, axis = turn(o.new_from_old)
         units = math.hypot(*shift)
-        along = f"<small>({', '.join(_number(v) for v in shift)})</small>"
+        along = f"<small>({', '.join(_number(v if abs(v) > 1e-3 * units else 0.0) for v in shift)})</small>"
         moved = f"{_number(units)}{_told_lengths(units, world)} {along}"
         about = f" <small>about ({', '.join(f'{v:.2f}' for v in axis)})</small>" if any(axis) else ""
         turned = f"{angle:.2f}°{about}"
     if sure is not None:
         spread = f"{_number(sure[0])}, {f'{sure[1]:.2f}°' if sure[1] < 180 else 'any turn'}"
     cells = (f'<span class="kind {o.kind}">{o.kind}</span>', moved, turned, spread, f"{o.confidence:.2f}")
-    return f"<tr><td>{index}</td>{''.join(f'<td>{c}</td>' for c in cells)}<td>{escape(o.note)}</td></tr>"
+    row = "".join(f"<td>{c}</td>" for c in (index, *cells))
+    return f'<tr>{row}<td class="note">{escape(o.note)}</td></tr>'
 
 
 def _told_lengths(units: float, world: World | None) -> str:
