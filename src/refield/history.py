@@ -19,7 +19,7 @@ from refield.field.radiance import Field
 from refield.field.render import render_many
 from refield.field.source import Known
 from refield.scene.camera import Camera
-from refield.scene.capture import Capture, Frame, camera_rays
+from refield.scene.capture import Capture, Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
 from refield.scene.images import frame_image, scaled_image, write_image
 from refield.update.composite import UpdatedField, layers_of, leaving, source_of
@@ -97,8 +97,10 @@ class _Retouched:
         frame = self.frame
         image = frame_image(frame).float() / 255
         part = min(max(1 / _COARSE, _LEAST / min(frame.camera.width, frame.camera.height)), 1.0)
-        coarse, _ = self._differs(frame.camera.shrunk(part))
-        mask = functional.interpolate(coarse[None, None], image.shape[:2])[0, 0] > 0.5
+        coarse = frame.camera.shrunk(part)
+        rays, near = self._near(coarse)
+        differs = self._differs(coarse, near, *(render_many(f, rays[near]).rgb for f in self.states))
+        mask = functional.interpolate(differs[None, None], image.shape[:2])[0, 0] > 0.5
         if mask.any():
             rays = camera_rays(frame.camera, frame.world_from_cam)
             image[mask] = render_many(self.states[1], rays[mask.reshape(-1)]).rgb
@@ -106,24 +108,25 @@ class _Retouched:
 
     def at(self, camera: Camera, now: Tensor) -> Tensor:
         """See `Made`."""
+        rays, near = self._near(camera)
+        was, late = render_many(self.states[0], rays[near]).rgb, now.reshape(-1, 3)[near]
         image = scaled_image(self.frame, camera)
-        mask, was = self._differs(camera, now)
         # not a picture without error: what the field gets wrong in photos is learnt from these
-        put_right = (now + image - was).clamp(0, 1)
-        return torch.where(mask[..., None] > 0.5, put_right, image)
+        put_right = image.clone()
+        put_right.view(-1, 3)[near] = (late + image.view(-1, 3)[near] - was).clamp(0, 1)
+        return torch.where(self._differs(camera, near, was, late)[..., None] > 0.5, put_right, image)
 
-    def _differs(self, camera: Camera, now: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """(H, W) float32, 1 where the two states look different from the frame's place, with a margin of a pixel. And
-        what the first of them shows, (H, W, 3), or ``now`` where no ray meets what changed."""
+    def _near(self, camera: Camera) -> tuple[Rays, Tensor]:
+        """A camera's rays from the frame's place, and which of them pass by what changed, (N,) bool."""
         rays = camera_rays(camera, self.frame.world_from_cam)
-        near = torch.stack([leaving(rays, box) for box in self.changed]).amax(0) > 0
-        shown = render_many(self.states[0], rays[near]).rgb
-        late = render_many(self.states[1], rays[near]).rgb if now is None else now.reshape(-1, 3)[near]
+        return rays, torch.stack([leaving(rays, box) for box in self.changed]).amax(0) > 0
+
+    def _differs(self, camera: Camera, near: Tensor, was: Tensor, late: Tensor) -> Tensor:
+        """(H, W) float32, 1 where two states look different along the rays that are ``near`` (their colours (K, 3)),
+        with a margin of a pixel."""
         mask = torch.zeros(1, 1, camera.height, camera.width)
-        mask.view(-1)[near] = ((shown - late).abs().amax(-1) > _SHOWS).float()
-        was = torch.zeros(camera.height, camera.width, 3) if now is None else now.clone()
-        was.view(-1, 3)[near] = shown
-        return functional.max_pool2d(mask, 3, stride=1, padding=1)[0, 0], was
+        mask.view(-1)[near] = ((was - late).abs().amax(-1) > _SHOWS).float()
+        return functional.max_pool2d(mask, 3, stride=1, padding=1)[0, 0]
 
 
 def _changed_boxes(now: Field) -> list[Tensor]:

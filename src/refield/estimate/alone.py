@@ -49,11 +49,8 @@ def object_alone(
     x, d = samples.positions(there)
     own = grid.contains(x) if old.source is None else grid.contains(x) & old.source.grid.contains(x)
     keep = own.nonzero()[:, 0]
-    at, left = (x[keep], d[keep]), samples.only(keep)
+    asked, along = (field, old.outlook.held) if old.source is None else (old.source, None)
     with torch.no_grad():
-        if old.source is None:
-            seen = shaded(field, at, field.density(at[0]), left, old.outlook.held)
-        else:
-            seen = shaded(old.source, at, old.source.density(at[0]), left)
+        seen = shaded(asked, (x[keep], d[keep]), asked.density(x[keep]), samples.only(keep), along)
     rgb[hit], depth[hit], opacity[hit] = seen.rgb, seen.depth, seen.opacity
     return Seen(rgb, depth, opacity)

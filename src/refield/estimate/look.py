@@ -20,7 +20,7 @@ from refield.field.radiance import Field
 from refield.field.render import visible_samples
 from refield.field.sampling import STOP
 from refield.field.volrend import Samples, composite, weights
-from refield.field.warp import crossing, inside_box, outline
+from refield.field.warp import crossing, outline
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
@@ -48,9 +48,8 @@ class Hidden:
     def __call__(self, x: Tensor) -> Tensor:
         """World points (S, 3) -> (S,) bool."""
         found = torch.zeros(len(x), dtype=torch.bool)
-        for grid, box in zip(self.grids, self._boxes):
-            near = (inside_box(x, box) & ~found).nonzero()[:, 0]
-            found[near] = grid.contains(x[near])
+        for grid in self.grids:
+            found |= grid.contains(x)
         return found
 
     def meets(self, rays: Rays) -> Tensor:

@@ -21,7 +21,6 @@ from refield.field.source import Source
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
-from refield.scene.pose import invert
 
 _CARVED_AWAY = 0.6  # voxels
 
@@ -153,7 +152,7 @@ class Old:
         """Its mask where it is looked up, and the motion (4, 4) from there to where it was."""
         if self.source is None:
             return self.grid, torch.eye(4, dtype=torch.float64)
-        return self.grid.moved(invert(self.source.now_from_then)), self.source.now_from_then
+        return self.grid.moved(self.source.then_from_now), self.source.now_from_then
 
     @cached_property
     def shape(self) -> OccupancyGrid:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 from torch import Tensor
@@ -11,7 +12,7 @@ from refield.field.outlook import Outlook
 from refield.field.radiance import Field
 from refield.field.sampling import OccupancySampler
 from refield.scene.change import OccupancyGrid
-from refield.scene.pose import transform
+from refield.scene.pose import invert, transform
 
 
 class Light(Protocol):
@@ -36,6 +37,11 @@ class Source:
     """the directions along which it may be asked"""
     lights: tuple[tuple[Tensor, Light], ...] = ()
     """The light that changed since, each with the motion (4, 4) that brings the object to where it changed"""
+
+    @cached_property
+    def then_from_now(self) -> Tensor:
+        """(4, 4) float64"""
+        return invert(self.now_from_then)
 
     @property
     def sampler(self) -> OccupancySampler:

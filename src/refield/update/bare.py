@@ -15,7 +15,7 @@ from refield.field.source import Source
 from refield.field.warp import Move, outline
 from refield.scene.capture import Frame, Rays, centres
 from refield.scene.change import OccupancyGrid, SceneChange
-from refield.scene.pose import invert, transform
+from refield.scene.pose import transform
 from refield.update.composite import UpdatedField
 from refield.update.region import Region
 
@@ -45,7 +45,7 @@ def _of_one(
     if source is None:
         unseen = ~_seen_by(cut.pretrained, old_eyes, x, step)
     else:  # the photos showed it where it stood when they were taken
-        unseen = ~_seen_by(source.field, old_eyes, transform(invert(source.now_from_then), x), step)
+        unseen = ~_seen_by(source.field, old_eyes, transform(source.then_from_now, x), step)
     shown = torch.zeros_like(unseen)
     if unseen.any():
         shown[unseen] = _seen_by(cut, new_eyes, transform(move.new_from_old, x[unseen]), step)

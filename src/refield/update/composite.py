@@ -25,7 +25,7 @@ from refield.field.warp import Move, crossing, inside_box, looked_up, moves_of, 
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.inside import in_boxes
-from refield.scene.pose import invert, rotate, transform
+from refield.scene.pose import rotate, transform
 from refield.update.light import Relighting
 from refield.update.region import Region, carved, grown, move_out
 
@@ -68,7 +68,7 @@ class Earlier:
 
 NOTHING_EARLIER = Earlier()
 _SOLID = 0.05  # opacity of a sample that was not empty before
-_NODES = 500  # of a grid, that are asked who answers for them
+_NODES = 500  # of a grid, that are asked instead of all
 _WHOLE = 0.8  # of them must be the same move's, for an object to be the one that it moved
 _PROBES = 8  # points a cell looked up when the sampler is recomputed: a moved surface crosses cells at any angle
 
@@ -222,8 +222,8 @@ class UpdatedField:
         sigma = flat.new_zeros(len(flat)).index_copy(0, to.old, s)
         rgb = torch.zeros_like(flat).index_copy(0, to.old, c)
         for found in to.sourced:
-            rows, then = found.rows, invert(found.source.now_from_then)
-            s, c = found.source(found.x, rotate(then, to.turned[rows]))
+            rows = found.rows
+            s, c = found.source(found.x, rotate(found.source.then_from_now, to.turned[rows]))
             c = self._relit(to.asked[rows], c, to.owner[rows])
             sigma, rgb = sigma.index_copy(0, rows, s), rgb.index_copy(0, rows, c)
         if self.helper is not None and len(to.helper):
@@ -254,7 +254,7 @@ class UpdatedField:
         for i, (outlook, source) in enumerate(zip(self.outlooks, self.sources)):
             mine = (mover == i).nonzero()[:, 0]
             if source is not None:
-                then = transform(invert(source.now_from_then), at[mine])
+                then = transform(source.then_from_now, at[mine])
                 held_there = source.grid.contains(then)
                 sourced.append(_Sourced(source, near[mine[held_there]], then[held_there]))
                 mine = mine[~held_there]
@@ -327,13 +327,18 @@ class _Routed:
     """what moved before, and is looked up where it first was"""
 
 
+def some_of(grid: OccupancyGrid) -> Tensor:
+    """Some hundreds of a grid's occupied nodes, spread over it, (K, 3) world."""
+    x = grid.occupied()
+    return x[:: max(1, len(x) // _NODES)]
+
+
 def source_of(field: Field, grid: OccupancyGrid) -> Source | None:
     """Where a field that has had updates looks up the object that ``grid`` holds; None if it does not move it as a
     whole, or has learnt parts of it since."""
     if not isinstance(field, UpdatedField):
         return None
-    x = grid.occupied()
-    x = x[:: max(1, len(x) // _NODES)]
+    x = some_of(grid)
     to = field._route(x)
     owner = to.owner.clone()
     owner[to.helper] = owner[to.ground] = -2

@@ -16,13 +16,12 @@ from refield.field.radiance import Field
 from refield.field.warp import Move, inside_box, outline
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.pose import transform
-from refield.update.composite import Earlier, Origin, UpdatedField, layers_of
+from refield.update.composite import Earlier, Origin, UpdatedField, layers_of, some_of
 from refield.update.region import Region, carved, grown, move_out
 
 _SAME = 0.5  # of one grid's nodes that lie in the other
 _BACK = 0.06  # of an object's mean side: so near to its old place it may be back there; the photos decide
 _TAUGHT = 2.0  # samples around an object that stood there, within which a helper has not learnt much
-_NODES = 500  # asked of a grid
 
 
 def earlier_of(field: Field, change: SceneChange, dilation: float) -> tuple[Field, Earlier]:
@@ -184,8 +183,7 @@ def _object(field: Field, layer: int, index: int) -> ObjectChange:
 
 def _part_in(grid: OccupancyGrid, other: OccupancyGrid) -> float:
     """The part of a grid's occupied nodes that lies in another."""
-    x = grid.occupied()
-    x = x[:: max(1, len(x) // _NODES)]
+    x = some_of(grid)
     return float(other.contains(x).float().mean()) if len(x) else 0.0
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from refield.field.encoding import Contraction
 from refield.field.sampling import OccupancySampler
-from refield.field.warp import crossing, inside_box, outline
+from refield.field.warp import crossing, outline
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
 
@@ -40,10 +40,8 @@ class Region:
         """World points (..., 3) -> (...,) bool."""
         flat = x.detach().reshape(-1, 3)
         found = torch.zeros(len(flat), dtype=torch.bool, device=x.device)
-        for grid, box in zip(self.grids, self.boxes):
-            near = (inside_box(flat, box) & ~found).nonzero()[:, 0]
-            if len(near):
-                found[near] = grid.contains(flat[near])
+        for grid in self.grids:
+            found |= grid.contains(flat)
         return found.reshape(x.shape[:-1])
 
     def sampler(self, step: float) -> OccupancySampler:

@@ -92,13 +92,9 @@ class Places:
 
 def places_of(change: SceneChange) -> Places:
     """The old and the new places of a change's objects."""
-    was = [_place(o.grid, o.masks, False) for o in change.objects if o.kind != "added"]
-    now = [_place(g, o.masks_in, o.kind == "added") for o in change.objects if (g := o.grid_now) is not None]
+    was = [Place(o.masks, o.grid, False) for o in change.objects if o.kind != "added"]
+    now = [Place(o.masks_in, g, o.kind == "added") for o in change.objects if (g := o.grid_now) is not None]
     return Places(tuple(was), tuple(now))
-
-
-def _place(grid: OccupancyGrid, masks: tuple[Tensor | None, ...], arrived_only: bool) -> Place:
-    return Place(masks, grid, arrived_only)
 
 
 def old_ring(places: Places, index: int, frame: Frame, shadow: float, far: float) -> Tensor | None:
