@@ -44,7 +44,7 @@ def state(workspace: Workspace, visit: int) -> Field:
     """
     field: Field = workspace.field()
     for number in changed_visits(workspace, visit):
-        field = load_updated(workspace.visit(number), field, workspace.change(number))
+        field = load_updated(workspace.visit(number), field, workspace.change(number, masks=False))
     return field
 
 
@@ -138,10 +138,15 @@ def _changed_boxes(now: Field) -> list[Tensor]:
 
 
 def untouched_psnr(shown: Sequence[Tensor], frames: Sequence[Frame], masks: Sequence[Tensor]) -> float:
-    """PSNR (dB) of pictures (H, W, 3) over the pixels of ``frames`` that are in no mask, all frames pooled."""
+    """PSNR (dB) of pictures over the pixels of ``frames`` that are in no mask, all frames pooled.
+
+    Pictures are (H, W, 3), of the photos' own sizes or smaller; masks (h, w) bool, of the photos' own.
+    """
     error, count = 0.0, 0
     for picture, frame, mask in zip(shown, frames, masks):
-        truth = frame_image(frame)[~mask].float() / 255
-        error += float((picture[~mask] - truth).square().sum())
-        count += truth.numel()
+        size = picture.shape[:2]
+        same = functional.adaptive_max_pool2d(mask[None].float(), size)[0] == 0
+        truth = scaled_image(frame, frame.camera.scaled(size[1], size[0]))
+        error += float((picture[same] - truth[same]).square().sum())
+        count += 3 * int(same.sum())
     return -10 * math.log10(max(error / max(count, 1), 1e-12))

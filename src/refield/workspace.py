@@ -259,9 +259,9 @@ class Workspace:
         save_change(folder, kept)
         return kept
 
-    def change(self, number: int, capture: Capture | None = None) -> SceneChange:
-        """What changed at a visit."""
-        return load_change(self.visit(number), capture)
+    def change(self, number: int, capture: Capture | None = None, *, masks: bool = True) -> SceneChange:
+        """What changed at a visit; see `load_change`."""
+        return load_change(self.visit(number), capture, masks=masks)
 
 
 def _copy_photos(folder: Path, frames: Sequence[Frame]) -> tuple[Frame, ...]:

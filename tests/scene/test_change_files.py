@@ -1,6 +1,7 @@
 """What is saved of a change comes back; what is damaged is refused."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -72,6 +73,17 @@ def test_round_trip(tmp_path, capture, change):
         if a.frame is not None:
             assert b.frame.path == a.frame.path.resolve() and b.frame.camera == a.frame.camera
             assert torch.equal(a.frame.world_from_cam, b.frame.world_from_cam)
+
+
+def test_masks_that_nobody_asks_for_are_not_read(tmp_path, capture, change):
+    folder = tmp_path / "visit"
+    save_change(folder, change)
+    shutil.rmtree(folder / "masks")
+    bare = load_change(folder, capture, masks=False)
+    assert [o.kind for o in bare.objects] == [o.kind for o in change.objects]
+    assert not any((*bare.masks_in, *bare.masks_out, *bare.unexplained, *(m for o in bare.objects for m in o.masks)))
+    with pytest.raises(InputError):
+        load_change(folder, capture)
 
 
 def test_the_json_is_the_one_that_is_promised(tmp_path, change):

@@ -6,9 +6,9 @@ import torch
 
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_many
-from refield.field.volrend import Samples, composite
+from refield.field.volrend import Samples, composite, interleaved
 from refield.scene.change import ObjectChange, SceneChange
-from refield.update.composite import UpdatedField, interleaved
+from refield.update.composite import UpdatedField
 from refield.update.region import carved, move_out
 from tests.update.worlds import Ball, BallWorld, at, change_of, grid_of, moved, views
 

@@ -24,6 +24,19 @@ def floor_points(n: int = 40_000) -> torch.Tensor:
     return x
 
 
+def test_light_is_laid_on_as_its_factors_say() -> None:
+    """Compiled, and in torch where gradients are asked for: inside, outside and at the border of the box."""
+    g = torch.Generator().manual_seed(2)
+    light = Relighting(BOX, 0.4 * torch.randn(7, 5, 3, 3, generator=g))
+    x = torch.cat([torch.rand(2000, 3, generator=g) * 2.6 - 1.3, BOX, torch.full((1, 3), torch.nan)])
+    rgb = torch.rand(len(x), 3, generator=g)
+    plainly = light.applied(x, rgb.clone().requires_grad_())
+    kept = rgb.clone()
+    torch.testing.assert_close(light.applied(x, rgb), plainly.detach(), atol=2e-6, rtol=0)
+    assert torch.equal(rgb, kept), "what was given stays"
+    assert torch.equal(plainly[-1].detach(), rgb[-1])
+
+
 def test_a_shadow_is_found_and_only_there() -> None:
     x = floor_points()
     distance = (x[:, :2] - torch.tensor([0.2, -0.1])).norm(dim=-1)

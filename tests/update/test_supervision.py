@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import pytest
 import torch
 
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, camera_rays
 from refield.scene.change import ObjectChange, SceneChange
-from refield.update.supervision import Places, changed_pixels, exposure, old_ring, places_of
-from tests.update.worlds import Ball, at, grid_of, looking_from
+from refield.scene.images import frame_image
+from refield.update import supervision
+from refield.update.supervision import (
+    Places,
+    changed_pixels,
+    exposure,
+    new_lessons,
+    old_ring,
+    places_of,
+    silhouette,
+)
+from tests.captures import write_capture
+from tests.update.worlds import Ball, BallWorld, at, grid_of, looking_from
 
 SIZE = 100
 CAMERA = Camera(SIZE, SIZE, 130.0, 130.0, 50.0, 50.0)
@@ -77,6 +91,32 @@ def test_the_silhouette_is_where_rays_meet_the_object() -> None:
     hit = ((rays.origins + along * rays.directions - centre).norm(dim=-1) < 0.25).reshape(SIZE, SIZE)
     found = seen(BALL)
     assert float((hit & found).sum() / (hit | found).sum()) > 0.93
+
+
+def test_of_a_large_photo_some_pixels_teach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each knows its place in its photo, by which the photos' own masks are asked; a silhouette keeps its size."""
+    frames = write_capture(tmp_path, 2).frames
+    camera = frames[0].camera
+    whole = silhouette((grid_of(BALL),), replace(FRAME, camera=CAMERA))
+    monkeypatch.setattr(supervision, "_PIXELS", 500)
+    small = silhouette((grid_of(BALL),), replace(FRAME, camera=CAMERA))
+    assert small.shape == whole.shape and (small & whole).sum() / (small | whole).sum() > 0.75
+    masks = [np.zeros((camera.height, camera.width), bool) for _ in frames]
+    masks[1][:, 10:20] = True
+    lessons = new_lessons(frames, BallWorld((BALL,)), masks)
+    assert [int((lessons.photo == i).sum()) for i in range(2)] == [500, 500]
+    u = lessons.place % camera.width
+    assert torch.equal(lessons.within(masks), (lessons.photo == 1) & (u >= 10) & (u < 20))
+    for i, frame in enumerate(frames):
+        mine = lessons.photo == i
+        rays, image = camera_rays(camera, frame.world_from_cam), frame_image(frame).reshape(-1, 3).float() / 255
+        torch.testing.assert_close(lessons.rays.directions[mine], rays.directions[lessons.place[mine]])
+        for shown, pixel in zip(
+            lessons.rgb[mine].T, image[lessons.place[mine]].T
+        ):  # of its own pixel, in some exposure
+            clear = ((shown > 0.01) & (shown < 0.99)).numpy()
+            line = np.polyfit(pixel.numpy()[clear], shown.numpy()[clear], 1)
+            assert clear.any() and np.abs(np.polyval(line, pixel.numpy()) - shown.numpy())[clear].max() < 1e-4
 
 
 def test_changed_pixels_hold_both_places() -> None:

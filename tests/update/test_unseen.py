@@ -80,7 +80,7 @@ def test_a_helper_is_told_what_was_looked_through() -> None:
     zeros = torch.zeros
     rays = Rays(zeros(0, 3), zeros(0, 3))
     nothing = Lit(
-        Lessons(rays, zeros(0, 3), zeros(0, dtype=torch.long)),
+        Lessons(rays, zeros(0, 3), *(zeros(0, dtype=torch.long) for _ in range(2))),
         Segments(zeros(0), zeros(0), zeros(0, 3), zeros(1, dtype=torch.long)),
     )
     sight = sight_of(frozen.pretrained, frames(), [BOX])

@@ -18,7 +18,7 @@ from refield.estimate.localize import LocalizeConfig
 from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.evaluate import Report, evaluate
 from refield.field.radiance import Field
-from refield.field.render import render_frame
+from refield.field.render import render_camera
 from refield.history import changed_visits, known_objects, retouched, state, untouched_psnr
 from refield.photos.taken import PhotoConfig
 from refield.report import summary, write_report
@@ -32,6 +32,8 @@ from refield.update.store import save_updated
 from refield.update.train import update_field
 from refield.workspace import Workspace
 
+SHOWN = 256 * 256
+"""pixels of a picture that a field has of a new photo, at most; an update is judged by it, and the page shows it"""
 MOST_LOST = 0.2
 """dB that the unchanged pixels of the new photos may lose before an update is refused"""
 
@@ -85,9 +87,9 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
     """
     workspace = Workspace.open(options.work)
     models = options.estimate.models.open()
-    given = None
+    capture, given = workspace.capture(), None
     if is_posed(options.photos):
-        given = load_new_photos(options.photos, workspace.capture(), warn=clock.warn)
+        given = load_new_photos(options.photos, capture, warn=clock.warn)
     with workspace.writing(), tempfile.TemporaryDirectory(prefix="refield-") as scratch:
         if given is None:
             how = Placing(options.intake, options.localize, models.describer)
@@ -98,7 +100,8 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         clock.stage("load the field")
         number = workspace.visits
         old = state(workspace, number)
-        capture = _capture_now(workspace, number, old, Path(scratch))
+        if changed_visits(workspace, number):
+            capture = retouched(capture, workspace.field(), old, Path(scratch))
         known = known_objects(old)
         change = estimate_change(
             capture, old, frames, options.estimate, on_stage=clock.stage, models=models, known=known
@@ -124,13 +127,6 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
     return Visit(workspace.visit(number + 1), change, evaluation)
 
 
-def _capture_now(workspace: Workspace, visit: int, now: Field, scratch: Path) -> Capture:
-    capture = workspace.capture()
-    if not changed_visits(workspace, visit):
-        return capture
-    return retouched(capture, workspace.field(), now, scratch)
-
-
 def _need_a_photo(photos: Path, change: SceneChange) -> None:
     if not change.frames:
         reasons = "; ".join(f"{p.name}: {p.why}" for p in change.photos)
@@ -148,8 +144,8 @@ def _updated(
 
 
 def _shown(field: Field, change: SceneChange) -> list[Tensor]:
-    """What a field shows from where each used new photo was taken, (H, W, 3) each."""
-    return [render_frame(field, frame).rgb for frame in change.frames]
+    """What a field shows from where each used new photo was taken, (H, W, 3) each, no larger than `SHOWN`."""
+    return [render_camera(field, f.camera.within(SHOWN), f.world_from_cam).rgb for f in change.frames]
 
 
 def _need_no_harm(change: SceneChange, before: Sequence[Tensor], after: Sequence[Tensor]) -> None:

@@ -41,7 +41,7 @@ def run(options: Visits) -> None:
 
 
 def _visit(workspace: Workspace, number: int) -> dict[str, Any]:
-    change, report = workspace.change(number), workspace.visit(number) / "report.json"
+    change, report = workspace.change(number, masks=False), workspace.visit(number) / "report.json"
     facts = read_json(report) if report.is_file() else {}
     return {
         "visit": number,

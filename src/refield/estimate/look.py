@@ -233,15 +233,9 @@ class View:
         return image[i, j]
 
 
-def working_camera(camera: Camera, max_pixels: int) -> Camera:
-    """The camera scaled down so that an image has at most ``max_pixels``."""
-    shrink = min(1.0, (max_pixels / (camera.width * camera.height)) ** 0.5)
-    return camera.shrunk(shrink)
-
-
 def view_of(radiance: Field, frame: Frame, max_pixels: int) -> View:
     """Load one photo and render the old field beside it."""
-    camera = working_camera(frame.camera, max_pixels)
+    camera = frame.camera.within(max_pixels)
     seen = see(radiance, camera_rays(camera, frame.world_from_cam))
     shape = (camera.height, camera.width)
     rgb = seen.rgb.reshape(*shape, 3).clamp(0, 1)

@@ -7,12 +7,9 @@ occlusion is right; where it is now is its grid reprojected and closed, whatever
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.estimate.lattice import grown
@@ -20,6 +17,8 @@ from refield.estimate.objects import Old, box_in, corners_of, patch_rays
 from refield.scene.capture import Frame
 from refield.scene.change import OccupancyGrid
 from refield.vision import pixels
+
+_PIXELS = 1 << 18  # of a photo, in which a place is projected; larger photos' masks are scaled up
 
 
 def masks_out(frames: Sequence[Frame], old: Old) -> tuple[Tensor | None, ...]:
@@ -29,12 +28,9 @@ def masks_out(frames: Sequence[Frame], old: Old) -> tuple[Tensor | None, ...]:
     for patch in old.patches:
         on = old.lattice.holds(near, patch.points)
         c, (x0, y0, x1, y1) = patch.camera, patch.box
-        full: NDArray[Any] = np.zeros((c.height, c.width), np.uint8)
-        full[y0:y1, x0:x1] = on * np.uint8(255)
-        size = (patch.frame.camera.width, patch.frame.camera.height)
-        if size != (c.width, c.height):
-            full = cv2.resize(full, size, interpolation=cv2.INTER_LINEAR)
-        found[patch.frame.name] = _tidy(full > 100)
+        full = np.zeros((c.height, c.width), bool)
+        full[y0:y1, x0:x1] = on
+        found[patch.frame.name] = _full_size(full, patch.frame)
     return tuple(found.get(f.name, torch.zeros(f.camera.height, f.camera.width, dtype=torch.bool)) for f in frames)
 
 
@@ -43,12 +39,13 @@ def masks_in(frames: Sequence[Frame], grid: OccupancyGrid) -> tuple[Tensor | Non
     return tuple(_projected(f, grid) for f in frames)
 
 
-def _tidy(mask: np.ndarray) -> Tensor:
+def _full_size(mask: np.ndarray, frame: Frame) -> Tensor:
+    mask = pixels.enlarged(mask, (frame.camera.height, frame.camera.width))
     return torch.from_numpy(pixels.fill_holes(pixels.close(mask, 5), 0.02 * mask.size))
 
 
 def _projected(frame: Frame, grid: OccupancyGrid) -> Tensor:
-    camera = frame.camera
+    camera = frame.camera.within(_PIXELS)
     out = np.zeros((camera.height, camera.width), bool)
     low, high = grid.tight_aabb().numpy()
     box = box_in(camera, frame, corners_of(low, high))
@@ -56,4 +53,4 @@ def _projected(frame: Frame, grid: OccupancyGrid) -> Tensor:
         x0, y0, x1, y1 = box
         hit = grid.met_by(patch_rays(camera, frame, box))
         out[y0:y1, x0:x1] = hit.reshape(y1 - y0, x1 - x0).numpy()
-    return _tidy(out)
+    return _full_size(out, frame)

@@ -7,12 +7,18 @@ ray i owns samples ``ray_offsets[i] : ray_offsets[i + 1]``, near to far.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from numba import njit, prange
+from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.field import kernels
+from refield.field.kernels.cpu.simd import JIT
 from refield.scene.capture import Rays
+
+_Samples = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -82,3 +88,30 @@ def composite(sigmas: Tensor, rgbs: Tensor, samples: Samples) -> Rendering:
     summed = kernels.accumulate(w, values, samples.ray_offsets)
     opacity = summed[:, 4]
     return Rendering(summed[:, :3], summed[:, 3] / opacity.clamp_min(1e-6), opacity)
+
+
+def interleaved(a: Samples, b: Samples) -> Samples:
+    """Two sets of samples of the same rays as one, near to far on each ray."""
+    offsets = a.ray_offsets + b.ray_offsets
+    if offsets.device.type != "cpu":
+        starts, ray = torch.cat([a.t_starts, b.t_starts]), torch.cat([a.ray_ids, b.ray_ids])
+        order = torch.argsort(ray.double() + starts.double() / (1 + starts.double()))
+        return Samples(starts[order], torch.cat([a.t_ends, b.t_ends])[order], offsets)
+    both = Samples(torch.empty(int(offsets[-1])), torch.empty(int(offsets[-1])), offsets)
+    parts = [tuple(t.numpy() for t in (s.t_starts, s.t_ends, s.ray_offsets)) for s in (a, b, both)]
+    _interleave(*parts)
+    return both
+
+
+@njit(parallel=True, **JIT)
+def _interleave(a: _Samples, b: _Samples, both: _Samples) -> None:
+    """Starts, ends and offsets of each; ``both`` has its offsets."""
+    for r in prange(len(both[2]) - 1):
+        i, j = a[2][r], b[2][r]
+        for k in range(both[2][r], both[2][r + 1]):
+            if j >= b[2][r + 1] or (i < a[2][r + 1] and a[0][i] <= b[0][j]):
+                both[0][k], both[1][k] = a[0][i], a[1][i]
+                i += 1
+            else:
+                both[0][k], both[1][k] = b[0][j], b[1][j]
+                j += 1

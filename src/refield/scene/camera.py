@@ -42,6 +42,10 @@ class Camera:
         """The same lens on a sensor of so many times as many pixels a side, one at least."""
         return self.scaled(max(round(self.width * part), 1), max(round(self.height * part), 1))
 
+    def within(self, most: int) -> Camera:
+        """The same lens on a sensor of at most so many pixels; itself if it has no more."""
+        return self.shrunk(min(1.0, (most / (self.width * self.height)) ** 0.5))
+
     def scaled(self, width: int, height: int) -> Camera:
         """The same lens seen on a sensor resampled to ``width`` x ``height`` pixels."""
         sx, sy = width / self.width, height / self.height

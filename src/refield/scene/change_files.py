@@ -26,6 +26,7 @@ from refield.scene.intrinsics import read_camera, write_camera
 
 NAME = "change.json"
 _MAX_GRID_BYTES = 1 << 30  # unpacked; a 512³ grid of floats is half of it
+_PHOTO_MASKS = ("masks_in", "masks_out", "unexplained")
 _REMEDY = "run the update again, or restore the file"
 
 
@@ -44,11 +45,14 @@ def save_change(folder: Path, change: SceneChange) -> None:
     write_json(folder / NAME, record)
 
 
-def load_change(folder: Path, capture: Capture | None = None, *, photos: Sequence[Frame] = ()) -> SceneChange:
+def load_change(
+    folder: Path, capture: Capture | None = None, *, photos: Sequence[Frame] = (), masks: bool = True
+) -> SceneChange:
     """Read what `save_change` wrote.
 
     With ``capture`` the masks are checked against its training frames. ``photos`` stand in, by name, for used
-    photos whose image does not lie in ``folder``.
+    photos whose image does not lie in ``folder``. Without ``masks`` there are none: reading them takes longest, and
+    whoever renders the field asks for none.
 
     Raises:
         InputError: a file or key is missing, or holds what it cannot.
@@ -56,12 +60,10 @@ def load_change(folder: Path, capture: Capture | None = None, *, photos: Sequenc
     record = read_json(folder / NAME)
     try:
         return SceneChange(
-            objects=tuple(_object_in(folder, o, capture) for o in record["objects"]),
+            objects=tuple(_object_in(folder, o, capture, masks) for o in record["objects"]),
             photos=tuple(_photo_in(folder, p, {f.name: f for f in photos}) for p in record["photos"]),
             why=str(record.get("why", "")),
-            masks_in=tuple(m for m in _masks_in(folder, record.get("masks_in", [])) if m is not None),
-            masks_out=tuple(m for m in _masks_in(folder, record.get("masks_out", [])) if m is not None),
-            unexplained=tuple(m for m in _masks_in(folder, record.get("unexplained", [])) if m is not None),
+            **{kind: _photo_masks(folder, record.get(kind, []), masks) for kind in _PHOTO_MASKS},
         )
     except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else f"is not a change ({error})"
@@ -86,7 +88,12 @@ def _object_out(folder: Path, index: int, o: ObjectChange) -> dict[str, Any]:
     }
 
 
-def _object_in(folder: Path, record: dict[str, Any], capture: Capture | None) -> ObjectChange:
+def _photo_masks(folder: Path, names: list[str | None], masks: bool) -> tuple[Tensor, ...]:
+    """Of the used new photos; empty if no masks are wanted."""
+    return tuple(m for m in _masks_in(folder, names) if m is not None) if masks else ()
+
+
+def _object_in(folder: Path, record: dict[str, Any], capture: Capture | None, masks: bool) -> ObjectChange:
     if record["kind"] not in ("moved", "removed", "added"):
         raise ValueError(f"the kind {record['kind']!r}")
     matrix, covariance = record["new_from_old"], record.get("covariance")
@@ -94,8 +101,8 @@ def _object_in(folder: Path, record: dict[str, Any], capture: Capture | None) ->
         kind=record["kind"],
         grid=_read_grid(inside(folder, record["grid"], str(folder / NAME))),
         new_from_old=None if matrix is None else _matrix(matrix, 4),
-        masks=_masks_in(folder, record.get("masks", [])),
-        masks_in=_masks_in(folder, record.get("masks_in", [])),
+        masks=_masks_in(folder, record.get("masks", [])) if masks else (),
+        masks_in=_masks_in(folder, record.get("masks_in", [])) if masks else (),
         confidence=float(record["confidence"]),
         covariance=None if covariance is None else _matrix(covariance, 6),
         note=str(record.get("note", "")),

@@ -108,7 +108,10 @@ def read_mask(path: Path, *, max_pixels: int = MAX_PIXELS) -> Tensor:
     with opened(path, max_pixels) as image:
         if image.mode not in _DIRECT + _WITH_ALPHA:
             raise InputError(path, f"has the pixel mode {image.mode}", "save the mask as 8-bit grey")
-        grey = np.array(ImageOps.exif_transpose(image).convert("RGB")).max(-1)
+        upright = ImageOps.exif_transpose(image)
+        if upright.mode == "1":
+            return torch.from_numpy(np.array(upright))
+        grey = np.array(upright.convert("RGB")).max(-1)
         return torch.from_numpy(grey > (127 if grey.max() > 1 else 0))
 
 

@@ -20,7 +20,7 @@ from refield.field.radiance import Field, HashField
 from refield.field.render import visible_samples
 from refield.field.sampling import OccupancySampler
 from refield.field.source import Source
-from refield.field.volrend import Samples
+from refield.field.volrend import Samples, interleaved
 from refield.field.warp import Move, crossing, inside_box, looked_up, moves_of, owners
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
@@ -391,11 +391,3 @@ def leaving(rays: Rays, box: Tensor) -> Tensor:
     """Distance at which each ray leaves a world box, (N,); 0 if it does not meet it."""
     enter, leave = crossing(rays, box)
     return torch.where(leave > enter, leave, 0.0)
-
-
-def interleaved(a: Samples, b: Samples) -> Samples:
-    """Two sets of samples of the same rays as one, near to far on each ray."""
-    starts = torch.cat([a.t_starts, b.t_starts])
-    ray = torch.cat([a.ray_ids, b.ray_ids])
-    order = torch.argsort(ray.double() + starts.double() / (1 + starts.double()))
-    return Samples(starts[order], torch.cat([a.t_ends, b.t_ends])[order], a.ray_offsets + b.ray_offsets)

@@ -23,11 +23,10 @@ def as_remembered(
 ) -> bool:
     """Whether the new photos show what earlier visits say is there, about as well as what did not change at all.
 
-    ``sparse`` are all pixels of the change's photos in order, ``changed`` their changed ones, ``recalled`` their
+    ``sparse`` are pixels of the change's photos, ``changed`` the changed ones of each, ``recalled`` its
     `recalled_pixels`, (H, W) bool each.
     """
-    known = torch.cat([torch.from_numpy(r).reshape(-1) for r in recalled])
-    still = ~torch.cat([torch.from_numpy(c).reshape(-1) for c in changed])
+    known, still = sparse.within(recalled), ~sparse.within(changed)
     told, same = (_error(cut, sparse, which) for which in (known, still))
     return told < _TRUST * same + _BLUNDER
 

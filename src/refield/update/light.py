@@ -7,13 +7,21 @@ pixels that were left out of a fit confirm it. Letters: P pixels, C lattice node
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
+from numba import njit, prange
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from refield.field.kernels.cpu.simd import JIT
 from refield.field.warp import inside_box
+
+_Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -37,6 +45,10 @@ class Relighting:
 
     def applied(self, x: Tensor, rgb: Tensor) -> Tensor:
         """World points (S, 3), colours (S, 3) -> colours in the new light (S, 3) in [0, 1]."""
+        if x.device.type == "cpu" and not (torch.is_grad_enabled() and (x.requires_grad or rgb.requires_grad)):
+            out = rgb.clone()
+            _relight(x.detach().float().numpy(), self.aabb.numpy(), self.log_gain.numpy(), out.numpy())
+            return out
         near = inside_box(x.detach(), self.aabb).nonzero()[:, 0]
         if len(near) == 0:
             return rgb
@@ -58,6 +70,29 @@ class Sightings:
 
     def __getitem__(self, chosen: Tensor) -> Sightings:
         return Sightings(self.x[chosen], self.photo[chosen], self.rendered[chosen], self.fold[chosen])
+
+
+@njit(parallel=True, **JIT)
+def _relight(x: _Array, aabb: _Array, log_gain: _Array, rgb: _Array) -> None:
+    """`Relighting.applied`, in place."""
+    nx, ny, nz = log_gain.shape[:3]
+    for s in prange(len(x)):
+        p, q, r = x[s, 0], x[s, 1], x[s, 2]
+        inside = p >= aabb[0, 0] and p <= aabb[1, 0] and q >= aabb[0, 1] and q <= aabb[1, 1]
+        if not (inside and r >= aabb[0, 2] and r <= aabb[1, 2]):
+            continue
+        p = (p - aabb[0, 0]) / (aabb[1, 0] - aabb[0, 0]) * (nx - 1)
+        q = (q - aabb[0, 1]) / (aabb[1, 1] - aabb[0, 1]) * (ny - 1)
+        r = (r - aabb[0, 2]) / (aabb[1, 2] - aabb[0, 2]) * (nz - 1)
+        i, j, k = min(int(p), nx - 2), min(int(q), ny - 2), min(int(r), nz - 2)
+        u, v, w = p - i, q - j, r - k
+        for c in range(3):
+            total = np.float32(0)
+            for corner in range(8):
+                a, b, d = corner >> 2 & 1, corner >> 1 & 1, corner & 1
+                weight = (u if a else 1 - u) * (v if b else 1 - v) * (w if d else 1 - w)
+                total += weight * log_gain[i + a, j + b, k + d, c]
+            rgb[s, c] = min(max(rgb[s, c] * math.exp(total), 0), 1)
 
 
 _COARSER = (4, 2, 1)  # lattice spacings of the pyramid, in the finest

@@ -19,9 +19,10 @@ from refield.field.radiance import Field
 from refield.field.render import render_many
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid, SceneChange
-from refield.vision.pixels import dilate, fit_colours
+from refield.vision.pixels import dilate, enlarged, fit_colours
 
 _UNTOUCHED_MARGIN = 0.03  # of the width: changed areas grow by this before colours are compared across visits
+_PIXELS = 1 << 18  # of a photo; more add time and nothing to learn
 _EXPOSURE_PIXELS = 4000  # a photo: enough for six numbers
 
 
@@ -34,19 +35,29 @@ class Lessons:
     """(N, 3) float32, in the old photos' exposure"""
     photo: Tensor
     """(N,) int64: index of the new photo, or -1 for an old one"""
+    place: Tensor
+    """(N,) int64: the pixel's place in its photo, row by row"""
 
     def __len__(self) -> int:
         return len(self.rgb)
 
     def __getitem__(self, chosen: Tensor | slice) -> Lessons:
-        return Lessons(self.rays[chosen], self.rgb[chosen], self.photo[chosen])
+        return Lessons(self.rays[chosen], self.rgb[chosen], self.photo[chosen], self.place[chosen])
 
     def followed_by(self, more: Lessons) -> Lessons:
         """These and then more."""
         origins = torch.cat([self.rays.origins, more.rays.origins])
         directions = torch.cat([self.rays.directions, more.rays.directions])
         colours, photos = torch.cat([self.rgb, more.rgb]), torch.cat([self.photo, more.photo])
-        return Lessons(Rays(origins, directions), colours, photos)
+        return Lessons(Rays(origins, directions), colours, photos, torch.cat([self.place, more.place]))
+
+    def within(self, masks: Sequence[np.ndarray]) -> Tensor:
+        """Which pixels are in the mask (H, W) bool of their new photo, (N,) bool."""
+        out = torch.zeros(len(self), dtype=torch.bool)
+        for i, mask in enumerate(masks):
+            mine = (self.photo == i).nonzero()[:, 0]
+            out[mine] = torch.from_numpy(mask.reshape(-1))[self.place[mine]]
+        return out
 
 
 @dataclass(frozen=True)
@@ -75,11 +86,12 @@ class Place:
 
 def silhouette(grids: Sequence[OccupancyGrid], frame: Frame) -> np.ndarray:
     """Where what any of the grids holds projects in a photo, hidden or not, (H, W) bool."""
-    rays = camera_rays(frame.camera, frame.world_from_cam)
+    camera = frame.camera.within(_PIXELS)
+    rays = camera_rays(camera, frame.world_from_cam)
     hit = torch.zeros(len(rays), dtype=torch.bool)
     for grid in grids:
         hit |= grid.met_by(rays)
-    return hit.reshape(frame.camera.height, frame.camera.width).numpy()
+    return enlarged(hit.reshape(camera.height, camera.width).numpy(), (frame.camera.height, frame.camera.width))
 
 
 @dataclass(frozen=True)
@@ -135,20 +147,22 @@ def changed_pixels(change: SceneChange, places: Places, index: int, frame: Frame
 
 
 def new_lessons(frames: Sequence[Frame], field: Field, changed: Sequence[np.ndarray]) -> Lessons:
-    """Every pixel of the new photos, in the old photos' exposure.
+    """The new photos' pixels, in the old photos' exposure; of large photos some of them.
 
     ``field`` is the old one with the objects cut out and moved, ``changed`` each photo's `changed_pixels`.
     """
-    bank = PixelBank(frames)
+    bank = PixelBank(frames, most=_PIXELS * len(frames))
     everything = torch.arange(len(bank))
-    rays, rgb = bank.rays(everything), bank.colours(everything)
-    for i, (frame, mask) in enumerate(zip(frames, changed)):
-        away = ~dilate(mask, math.ceil(_UNTOUCHED_MARGIN * frame.camera.width)).reshape(-1)
-        still = torch.from_numpy(away).nonzero()[:, 0][:: max(1, int(away.sum()) // _EXPOSURE_PIXELS)]
+    out = Lessons(bank.rays(everything), bank.colours(everything), bank.frame_of(everything), bank.place_of(everything))
+    wide = [dilate(mask, math.ceil(_UNTOUCHED_MARGIN * mask.shape[1])) for mask in changed]
+    still = ~out.within(wide)
+    for i in range(len(frames)):
         mine = slice(int(bank.starts[i]), int(bank.starts[i + 1]))
-        affine = exposure(rgb[mine][still], render_many(field, rays[mine][still]).rgb)
-        rgb[mine] = (rgb[mine] * affine[0] + affine[1]).clamp(0, 1)
-    return Lessons(rays, rgb, bank.frame_of(everything))
+        some = still[mine].nonzero()[:, 0]
+        some = mine.start + some[:: max(1, len(some) // _EXPOSURE_PIXELS)]
+        affine = exposure(out.rgb[some], render_many(field, out.rays[some]).rgb)
+        out.rgb[mine] = (out.rgb[mine] * affine[0] + affine[1]).clamp(0, 1)
+    return out
 
 
 def exposure(photo: Tensor, rendered: Tensor) -> Tensor:

@@ -36,9 +36,11 @@ from refield.vision.pixels import dilate
 
 DEFAULTS = UpdateConfig()
 _PATCHES, _FOLDS, _SHADING_CELLS = 8, 4, 24  # an object's side in patches that are left out together; in cells
-_LIT_RAYS = 60_000  # of the new photos; a lattice of factors is no finer than they show
+_LIT_RAYS = 60_000  # of the new photos, for the light on all and on each object; a lattice of factors is no finer
+_NEW_RAYS = 1 << 18  # of the new photos, through the region; more than training draws
 _MADE = 20  # of the old photos that an earlier visit put out of date; each takes longer to put right than to learn from
 _GROUND_RAYS = 12_000  # that planes are looked for along
+_RING_ASKED = 1 << 20  # of the old photos' pixels, whether their rays meet the region
 _RING_RAYS = 40_000  # of the old photos; more add time and nothing to learn
 
 
@@ -95,7 +97,7 @@ def update_field(
     # what earlier visits know has been taken from them already; of the rest no old photo shows anything
     old = _old_lessons(capture, cut, region, config, light) if cut.to_learn.objects else known.sparse[:0]
     ground = _ground(known, old, wide, eyes, max(_pixel(change, middle), step))
-    sparse = known.sparse[meets(region, known.sparse.rays).nonzero()[:, 0]]
+    sparse = known.sparse[_some(meets(region, known.sparse.rays).nonzero()[:, 0], _NEW_RAYS)]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
     say("freeze")
@@ -121,7 +123,7 @@ class _Known:
     cut: UpdatedField
     """the old field, with the objects moved and cut out, and what earlier visits know"""
     sparse: Lessons
-    """all pixels of the new photos"""
+    """pixels of the new photos"""
     changed: tuple[np.ndarray, ...]
     """of each new photo, (H, W) bool: what arrived or left"""
     recalled: tuple[np.ndarray, ...]
@@ -178,9 +180,9 @@ def _light(known: _Known) -> Relighting | None:
     side = max(float((o.grid.tight_aabb().diff(dim=0)).max()) for o in change.objects)
     box = torch.stack([box[0] - 1.5 * side, box[1] + 1.5 * side])
     unknown = [c & ~r for c, r in zip(known.changed, known.recalled)]
-    still = torch.cat([torch.from_numpy(~dilate(c, math.ceil(0.01 * c.shape[1]))).reshape(-1) for c in unknown])
+    still = ~sparse.within([dilate(c, math.ceil(0.01 * c.shape[1])) for c in unknown])
     may = (still & (leaving(sparse.rays, box) > 0)).nonzero()[:, 0]
-    seen = sparse[may[torch.randperm(len(may))[:_LIT_RAYS].sort().values]]
+    seen = sparse[_some(may, _LIT_RAYS)]
     was = render_many(known.cut, seen.rays)
     x = seen.rays.origins + seen.rays.directions * was.depth[:, None]
     solid = (was.opacity > 0.9).nonzero()[:, 0]
@@ -200,7 +202,7 @@ def _shading(sparse: Lessons, cut: UpdatedField, change: SceneChange) -> tuple[R
     out: list[Relighting | None] = []
     for i, move in enumerate(cut.moves):
         near = meets(Region((move.grid.moved(move.new_from_old),)).sampler(cut.sampler.step), sparse.rays)
-        seen = sparse[near.nonzero()[:, 0]]
+        seen = sparse[_some(near.nonzero()[:, 0], _LIT_RAYS)]
         now = render_many(cut, seen.rays)
         x = seen.rays.origins + seen.rays.directions * now.depth[:, None]
         asked = transform(move.old_from_new, x)
@@ -225,14 +227,19 @@ def _old_lessons(
         ring = old_ring(places, i, capture.train[i], config.shadow, config.far)
         if ring is not None:
             chosen.append(ring.reshape(-1).nonzero()[:, 0] + bank.starts[k])
-    pixels = torch.cat(chosen) if chosen else torch.zeros(0, dtype=torch.long)
+    pixels = _some(torch.cat(chosen) if chosen else torch.zeros(0, dtype=torch.long), _RING_ASKED)
     pixels = pixels[meets(region, bank.rays(pixels)).nonzero()[:, 0]]
-    pixels = pixels[torch.randperm(len(pixels))[:_RING_RAYS]].sort().values
+    pixels = _some(pixels, _RING_RAYS)
     rays, rgb = bank.rays(pixels), bank.colours(pixels)
     if light is not None:
         was = render_many(cut.pretrained, rays)
         rgb = light.applied(rays.origins + rays.directions * was.depth[:, None], rgb)
-    return Lessons(rays, rgb, torch.full((len(rgb),), -1))
+    return Lessons(rays, rgb, torch.full((len(rgb),), -1), bank.place_of(pixels))
+
+
+def _some(rows: Tensor, most: int) -> Tensor:
+    """``most`` of the rows (K,) at random, in order; all, if there are no more."""
+    return rows if len(rows) <= most else rows[torch.randperm(len(rows))[:most].sort().values]
 
 
 def _beside(region: Region) -> list[Tensor]:

@@ -77,6 +77,13 @@ def close(mask: Mask, size: int = 5) -> Mask:
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)).astype(bool)
 
 
+def enlarged(mask: Mask, shape: tuple[int, int]) -> Mask:
+    """A mask that may be of a smaller picture, for one of ``shape`` (H, W)."""
+    if mask.shape == shape:
+        return mask
+    return cv2.resize(mask * np.uint8(255), shape[::-1], interpolation=cv2.INTER_LINEAR) > 100
+
+
 def fill_holes(mask: Mask, largest: float) -> Mask:
     """Fill enclosed holes of at most ``largest`` pixels."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.estimate.detect import Mask
-from refield.estimate.look import Array, View, working_camera
+from refield.estimate.look import Array, View
 from refield.estimate.paper.detect import Box, enlarged
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame
@@ -79,7 +79,7 @@ def old_masks(
     frames: Sequence[Frame], cloud: Array, segmenter: Segmenter, max_pixels: int, config: SegmentConfig
 ) -> list[OldMask]:
     """Ask the segmenter for an object's cloud (N, 3) in every old photo, scaled down to ``max_pixels``."""
-    return [_old_mask(f, working_camera(f.camera, max_pixels), cloud, segmenter, config) for f in frames]
+    return [_old_mask(f, f.camera.within(max_pixels), cloud, segmenter, config) for f in frames]
 
 
 def _old_mask(frame: Frame, camera: Camera, cloud: Array, segmenter: Segmenter, config: SegmentConfig) -> OldMask:
