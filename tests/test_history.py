@@ -1,7 +1,9 @@
 """Old photos as if taken now: what a later update may learn from."""
 
+import numpy as np
 import torch
 
+from refield.estimate.look import view_of
 from refield.field.render import render_camera
 from refield.history import known_objects, retouched, untouched_psnr
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
@@ -34,12 +36,15 @@ def test_old_photos_are_brought_up_to_date_when_they_are_looked_at(tmp_path):
     assert same.any() and not same[differs].all()
     assert torch.equal(frame_image(frame), (image * 255).to(torch.uint8))  # and not made again
     assert frame.made is not None
-    at_once = frame.made.at(frame.camera, shown[1])  # without a file, and with what the field gets wrong in the photo
+    at_once = frame.made.at(frame.camera, *shown)  # without a file, and with what the field gets wrong in the photo
     assert torch.allclose(at_once[differs], (shown[1] + photo - shown[0]).clamp(0, 1)[differs], atol=1e-5)
     assert torch.equal(at_once[same], photo[same])
     small = frame.camera.shrunk(0.5)
-    halved = frame.made.at(small, render_camera(now, small, frame.world_from_cam).rgb)
+    halved = frame.made.at(small, *(render_camera(f, small, frame.world_from_cam).rgb for f in (old, now)))
     assert halved.shape == (small.height, small.width, 3)
+    view = view_of(now, frame, small.width * small.height)
+    assert np.allclose(view.photo, halved, atol=1e-3)
+    assert np.allclose(view.rgb, render_camera(now, small, frame.world_from_cam).rgb, atol=2e-3)
 
 
 def test_what_moved_is_known_where_it_is_now():

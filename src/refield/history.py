@@ -72,12 +72,13 @@ def retouched(capture: Capture, before: Field, now: Field, folder: Path) -> Capt
     The photos are from ``before``; an update must not learn from them what an earlier visit has put right. Each is
     written as a PNG into ``folder`` when it is first looked at: few are, where every object is known.
     """
-    changed = _changed_boxes(now)
-    if not changed:
+    shapes = tuple(box for update in layers_of(now) for box in update.boxes)
+    lights = tuple(update.light.aabb for update in layers_of(now) if update.light is not None)
+    if not shapes:
         return capture
 
     def one(frame: Frame, name: str) -> Frame:
-        return replace(frame, path=folder / name, made=_Retouched(frame, (before, now), changed))
+        return replace(frame, path=folder / name, made=_Retouched(frame, before, now, shapes, lights))
 
     return replace(capture, frames=tuple(one(f, f"{i:04d}.png") for i, f in enumerate(capture.frames)))
 
@@ -88,53 +89,49 @@ class _Retouched:
 
     frame: Frame
     """as photographed"""
-    states: tuple[Field, Field]
-    """then and now"""
-    changed: Sequence[Tensor]
-    """world boxes (2, 3); only rays through them are compared"""
+    before: Field
+    now: Field
+    shapes: tuple[Tensor, ...]
+    """world boxes (2, 3) of everything that is not as it was"""
+    lights: tuple[Tensor, ...]
+    """and of where only the light changed"""
 
     def __call__(self, path: Path) -> None:
         frame = self.frame
         image = frame_image(frame).float() / 255
         part = min(max(1 / _COARSE, _LEAST / min(frame.camera.width, frame.camera.height)), 1.0)
         coarse = frame.camera.shrunk(part)
-        rays, near = self._near(coarse)
-        differs = self._differs(coarse, near, *(render_many(f, rays[near]).rgb for f in self.states))
-        mask = functional.interpolate(differs[None, None], image.shape[:2])[0, 0] > 0.5
+        rays = camera_rays(coarse, frame.world_from_cam)
+        near = _through(rays, self.shapes + self.lights).nonzero()[:, 0]
+        was, now = torch.zeros(2, coarse.height, coarse.width, 3)
+        for field, shown in ((self.before, was), (self.now, now)):
+            shown.view(-1, 3)[near] = render_many(field, rays[near]).rgb
+        mask = functional.interpolate(_differs(was, now)[None, None], image.shape[:2])[0, 0] > 0.5
         if mask.any():
             rays = camera_rays(frame.camera, frame.world_from_cam)
-            image[mask] = render_many(self.states[1], rays[mask.reshape(-1)]).rgb
+            image[mask] = render_many(self.now, rays[mask.reshape(-1)]).rgb
         write_image(path, image)
 
-    def at(self, camera: Camera, now: Tensor) -> Tensor:
+    def near(self, rays: Rays) -> Tensor:
         """See `Made`."""
-        rays, near = self._near(camera)
-        was, late = render_many(self.states[0], rays[near]).rgb, now.reshape(-1, 3)[near]
+        return _through(rays, self.shapes)
+
+    def at(self, camera: Camera, was: Tensor, now: Tensor) -> Tensor:
+        """See `Made`."""
         image = scaled_image(self.frame, camera)
         # not a picture without error: what the field gets wrong in photos is learnt from these
-        put_right = image.clone()
-        put_right.view(-1, 3)[near] = (late + image.view(-1, 3)[near] - was).clamp(0, 1)
-        return torch.where(self._differs(camera, near, was, late)[..., None] > 0.5, put_right, image)
-
-    def _near(self, camera: Camera) -> tuple[Rays, Tensor]:
-        """A camera's rays from the frame's place, and which of them pass by what changed, (N,) bool."""
-        rays = camera_rays(camera, self.frame.world_from_cam)
-        return rays, torch.stack([leaving(rays, box) for box in self.changed]).amax(0) > 0
-
-    def _differs(self, camera: Camera, near: Tensor, was: Tensor, late: Tensor) -> Tensor:
-        """(H, W) float32, 1 where two states look different along the rays that are ``near`` (their colours (K, 3)),
-        with a margin of a pixel."""
-        mask = torch.zeros(1, 1, camera.height, camera.width)
-        mask.view(-1)[near] = ((was - late).abs().amax(-1) > _SHOWS).float()
-        return functional.max_pool2d(mask, 3, stride=1, padding=1)[0, 0]
+        return torch.where(_differs(was, now)[..., None] > 0.5, (now + image - was).clamp(0, 1), image)
 
 
-def _changed_boxes(now: Field) -> list[Tensor]:
-    """World boxes (2, 3) of everything that the visits that led to a field changed, light included."""
-    boxes: list[Tensor] = []
-    for update in layers_of(now):
-        boxes += update.boxes + ((update.light.aabb,) if update.light is not None else ())
-    return boxes
+def _through(rays: Rays, boxes: Sequence[Tensor]) -> Tensor:
+    """Which rays cross any of some world boxes (2, 3), (N,) bool."""
+    return torch.stack([leaving(rays, box) for box in boxes]).amax(0) > 0
+
+
+def _differs(was: Tensor, now: Tensor) -> Tensor:
+    """(H, W) float32, 1 where two pictures (H, W, 3) look different, with a margin of a pixel."""
+    mask = ((was - now).abs().amax(-1) > _SHOWS).float()
+    return functional.max_pool2d(mask[None, None], 3, stride=1, padding=1)[0, 0]
 
 
 def untouched_psnr(shown: Sequence[Tensor], frames: Sequence[Frame], masks: Sequence[Tensor]) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 from torch.nn import functional
 
 from refield.field import fit_nerfacto as fitting
@@ -19,6 +20,7 @@ from refield.field.fit_nerfacto import NerfactoFitConfig, fit_nerfacto, proposal
 from refield.field.interlevel import bounds, interlevel_loss
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
 from refield.field.proposal import (
+    Density,
     Histogram,
     Plan,
     Span,
@@ -31,6 +33,7 @@ from refield.field.proposal import (
 )
 from refield.field.radiance import Field
 from refield.field.render import render_frame, render_rays, visible_samples
+from refield.field.volrend import Samples
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, Rays, camera_rays
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
@@ -273,6 +276,48 @@ def test_it_can_be_updated() -> None:
     torch.testing.assert_close(updated.density(x + shift), field.density(x), rtol=1e-3, atol=1e-5)
     torch.testing.assert_close(updated.density(x + 5), field.density(x + 5))
     assert torch.isfinite(render_rays(updated, some_rays(10)).rgb).all()
+
+
+class Seen(NerfactoField):
+    """Proposal networks that know a ball at the centre and a wall behind it."""
+
+    @property
+    def densities(self) -> tuple[Density, ...]:
+        def density(x: Tensor) -> Tensor:
+            return torch.where((x.norm(dim=-1) < 0.4) | (x[:, 0] - 1.5).abs().le(0.1), 40.0, 0.0)
+
+        return (density, density)
+
+
+def test_what_left_is_not_looked_at_but_what_is_behind_it() -> None:
+    field = Seen(SMALL, looking_everywhere(Contraction(torch.zeros(3), 2.0), SMALL)).eval()
+    rays = Rays(torch.tensor([[-2.0, 0.0, 0.0], [-2.0, 1.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]] * 2))
+
+    def looked_at(samples: Samples, ray: int, start: float, end: float) -> int:
+        x = samples.positions(rays)[0][samples.ray_ids == ray, 0]
+        return int(((x > start) & (x < end)).sum())
+
+    was, now = field.samples(rays), field.samples(rays, without=lambda x: x.norm(dim=-1) < 0.45)
+    assert looked_at(was, 0, -0.45, 0.45) > 3 and looked_at(now, 0, -0.45, 0.45) == 0
+    assert looked_at(now, 0, 1.2, 1.8) >= looked_at(was, 1, 1.2, 1.8) > looked_at(was, 0, 1.2, 1.8)
+    beside = now.ray_ids == 1
+    assert torch.equal(now.t_starts[beside], was.t_starts[was.ray_ids == 1]), "another ray is none of its business"
+
+
+def test_an_updated_field_keeps_what_did_not_change() -> None:
+    """Rays that pass by nothing that changed are looked at as before; what no photo saw is not shown."""
+    field, there = small_nerfacto(), torch.eye(4).double()
+    there[0, 3] = 0.5
+    grid = OccupancyGrid(torch.tensor([[-0.8] * 3, [0.8] * 3]), torch.ones(3, 3, 3))
+    updated = UpdatedField(field, SceneChange((ObjectChange("moved", grid, there),)))
+    rays = Rays(torch.tensor([[-1.0, 0.0, 6.0]]).expand(20, 3), functional.normalize(torch.randn(20, 3), dim=-1))
+    rays = rays[rays.directions[:, 2] > 0]
+    torch.testing.assert_close(render_rays(updated, rays).rgb, render_rays(field, rays).rgb)
+    hidden = updated.unshown(torch.arange(updated.sampler.grid.numel()))
+    assert render_rays(hidden, rays).opacity.max() == 0 and render_rays(updated, rays).opacity.min() > 0.1
+    x = 0.1 * torch.randn(20, 3) + torch.tensor([0.5, 0.0, 0.0])  # moved there
+    through = Rays(x - 5 * rays.directions[:1], rays.directions[:1].expand(20, 3))
+    assert render_rays(hidden, through).opacity.max() > 0
 
 
 def test_field_survives_its_files(tmp_path: Path) -> None:

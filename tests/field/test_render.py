@@ -12,6 +12,7 @@ from refield.field.encoding import Contraction
 from refield.field.radiance import Field
 from refield.field.render import render_camera, render_many, render_rays
 from refield.field.sampling import OccupancySampler
+from refield.field.volrend import Samples, composite
 from refield.scene.camera import Camera
 from refield.scene.capture import Rays, camera_rays
 from refield.scene.pose import exp
@@ -100,3 +101,13 @@ def test_contraction_keeps_the_core_and_bounds_the_rest() -> None:
     torch.testing.assert_close(y[0], torch.zeros(3))
     torch.testing.assert_close(y[1], torch.tensor([1.0, 0, 0]))
     assert math.isclose(float(y[2, 0]), 2.0, abs_tol=1e-4)
+
+
+def test_a_trace_of_light_does_not_move_a_surface_to_the_background() -> None:
+    """By hand: a ray of which all but 2 % is stopped at 1, the rest by a background that goes on for ever; and one that
+    meets but the background."""
+    samples = Samples(torch.tensor([0.95, 1.05, 1.0]), torch.tensor([1.05, 900.0, 3.0]), torch.tensor([0, 2, 3]))
+    sigmas = torch.tensor([-math.log(0.02) / 0.1, 60.0, 60.0])
+    out = composite(sigmas, torch.ones(3, 3), samples)
+    torch.testing.assert_close(out.depth, torch.tensor([1.0, 2.0]))
+    torch.testing.assert_close(out.opacity, torch.ones(2))

@@ -6,7 +6,7 @@ that the layer slides over the image: a hash grid's own gradients oscillate, tho
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -120,15 +120,34 @@ class Layers:
         return sampler_around(self.sight.field, self.old)
 
     @cached_property
+    def _known(self) -> bool:
+        """Whether the field was rendered at the same size already."""
+        return all(self.sight.past[c.photo_index].view.camera == c.camera for c in self.crops)
+
+    def _cut(self, image_of: Callable[[Past], NDArray[np.float32]]) -> Tensor:
+        """The crops' part of images that are known, (N, ...)."""
+        found = [(image_of(self.sight.past[c.photo_index]), c.box) for c in self.crops]
+        parts = [image[y0:y1, x0:x1].reshape(-1, *image.shape[2:]) for image, (x0, y0, x1, y1) in found]
+        return torch.from_numpy(np.concatenate(parts))
+
+    @cached_property
+    def _plain(self) -> Seen:
+        """What the old field shows."""
+        return see(self.sight.field, self._rays)
+
+    @cached_property
+    def _before(self) -> Tensor:
+        """(N, 3) its colours."""
+        return self._cut(lambda p: p.view.rgb) if self._known else self._plain.rgb
+
+    @cached_property
     def _behind(self) -> tuple[Tensor, Tensor]:
-        """Colour (N, 3) and depth (N,) without the objects; rendered, unless that was done at the same size."""
-        past = [self.sight.past[c.photo_index] for c in self.crops]
-        if all(p.view.camera == c.camera for p, c in zip(past, self.crops)):
-            cut = [(slice(c.box[1], c.box[3]), slice(c.box[0], c.box[2])) for c in self.crops]
-            rgb = np.concatenate([p.rgb[at].reshape(-1, 3) for p, at in zip(past, cut)])
-            depth = np.concatenate([p.beyond[at].reshape(-1) for p, at in zip(past, cut)])
-            return torch.from_numpy(rgb), torch.from_numpy(depth)
-        seen = see(self.sight.field, self._rays, Hidden(tuple(o.haze for o in self.sight.olds)))
+        """Colour (N, 3) and depth (N,) without the objects."""
+        if self._known:
+            return self._cut(lambda p: p.rgb), self._cut(lambda p: p.beyond)
+        hidden = Hidden(tuple(o.haze for o in self.sight.olds))
+        near = hidden.meets(self._rays).nonzero()[:, 0]
+        seen = self._plain.with_rows(near, see(self.sight.field, self._rays[near], hidden))
         return seen.rgb, seen.depth
 
     def show(self, new_from_old: Tensor) -> list[Layer]:
@@ -176,7 +195,7 @@ class Layers:
 
     def compared(self, new_from_old: Tensor) -> list[Compared]:
         """What `explained` asks for, per crop."""
-        before = see(self.sight.field, self._rays).rgb.split(self._sizes)
+        before = self._before.split(self._sizes)
         out = []
         for crop, shown, old in zip(self.crops, self.show(new_from_old), before):
             photo, composite, unchanged = (t.reshape(*crop.shape, 3).numpy() for t in (crop.photo, shown.rgb, old))

@@ -72,6 +72,11 @@ class Seen:
     opacity: Tensor
     """(N,) float32"""
 
+    def with_rows(self, rows: Tensor, other: Seen) -> Seen:
+        """The same, but for some rays (K,) int64."""
+        mine = (self.rgb, self.depth, self.opacity)
+        return Seen(*(a.index_copy(0, rows, b) for a, b in zip(mine, (other.rgb, other.depth, other.opacity))))
+
 
 def see(field: Field, rays: Rays, hidden: Hidden | None = None) -> Seen:
     """Colour, median depth and opacity of rays through the field, without the samples that are ``hidden``."""
@@ -235,15 +240,20 @@ class View:
 
 def view_of(radiance: Field, frame: Frame, max_pixels: int) -> View:
     """Load one photo and render the old field beside it."""
-    camera = frame.camera.within(max_pixels)
-    seen = see(radiance, camera_rays(camera, frame.world_from_cam))
-    shape = (camera.height, camera.width)
-    rgb = seen.rgb.reshape(*shape, 3).clamp(0, 1)
+    camera, made = frame.camera.within(max_pixels), frame.made
+    rays, shape = camera_rays(camera, frame.world_from_cam), (camera.height, camera.width)
+    if made is None:
+        seen = see(radiance, rays)
+        photo = scaled_image(frame, camera)
+    else:  # where only light has changed since, the photo goes with the field that it was taken for, which is faster
+        was, near = see(made.before, rays), made.near(rays).nonzero()[:, 0]
+        seen = was.with_rows(near, see(radiance, rays[near]))
+        photo = made.at(camera, *(s.rgb.reshape(*shape, 3).clamp(0, 1) for s in (was, seen)))
     return View(
         frame,
         camera,
-        (scaled_image(frame, camera) if frame.made is None else frame.made.at(camera, rgb)).numpy(),
-        rgb.numpy(),
+        photo.numpy(),
+        seen.rgb.reshape(*shape, 3).clamp(0, 1).numpy(),
         seen.depth.reshape(shape).numpy(),
         seen.opacity.reshape(shape).numpy(),
     )

@@ -75,6 +75,7 @@ REDUCED = NerfactoFitConfig(
         log2_table=16,
         width=32,
         first_density=0.1,
+        step=1 / 80,
     ),
 )
 """A shape and a schedule for a CPU: nerfstudio's take hours there"""

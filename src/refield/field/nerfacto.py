@@ -7,6 +7,7 @@ points, N rays, K intervals a ray.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,9 @@ from refield.field.sampling import OccupancySampler
 from refield.field.stored import State, read_field, sampler_from, state_of, write_field
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
+
+Inside = Callable[[Tensor], Tensor]
+"""World points (S, 3) -> whether they are inside of something, (S,) bool"""
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class NerfactoConfig:
     occupancy: int = 128
     """cells a side of the occupancy grid for those who march through the field instead of proposing"""
     step: float = 1 / 192
-    """length of a sample for them, core radii"""
+    """length of a sample for them, core radii: several of the finest cells"""
 
 
 class NerfactoField(nn.Module):
@@ -133,11 +137,18 @@ class NerfactoField(nn.Module):
         counts = (*(p.samples for p in self.config.proposals), self.config.samples)
         return propose(rays, densities or self.densities, Plan(self.span, counts, anneal), jitter)
 
-    def samples(self, rays: Rays, jitter: bool = False) -> Samples:
-        """Where to evaluate the field along rays: where the proposal networks expect something to be seen."""
+    def samples(self, rays: Rays, jitter: bool = False, without: Inside | None = None) -> Samples:
+        """Where to evaluate the field along rays: where the proposal networks expect something to be seen.
+
+        ``without`` says of which places the field holds nothing any more: nothing is looked at there, and more
+        closely at what is behind.
+        """
         with torch.no_grad():
-            _, edges = self.propose(rays, jitter)
-            return self.span.samples(edges)
+            if without is None:
+                return self.span.samples(self.propose(rays, jitter)[1])
+            left = tuple(_outside(d, without) for d in self.densities)
+            found = self.span.samples(self.propose(rays, jitter, densities=left)[1])
+            return found.only(~without(found.positions(rays)[0]))
 
     def _contracted(self, x: Tensor) -> Tensor:
         return self.contraction(x.reshape(-1, 3))
@@ -172,6 +183,16 @@ class NerfactoField(nn.Module):
     def looking_where(self, grid: Tensor) -> None:
         """Replace the occupancy grid (R, R, R) uint8 that others march through; own samples do not heed it."""
         self.sampler = replace(self.sampler, grid=grid)
+
+
+def _outside(density: Density, inside: Inside) -> Density:
+    """The same density, but for where there is none."""
+
+    def left(x: Tensor) -> Tensor:
+        sigma = density(x)
+        return torch.where(inside(x), torch.zeros_like(sigma), sigma)
+
+    return left
 
 
 def looking_everywhere(contraction: Contraction, config: NerfactoConfig) -> OccupancySampler:

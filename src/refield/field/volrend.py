@@ -18,6 +18,7 @@ from refield.field import kernels
 from refield.field.kernels.cpu.simd import JIT
 from refield.scene.capture import Rays
 
+_TRACE = 0.05  # light that reaches a background which goes on for ever, and would move the mean distance there
 _Samples = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 
 
@@ -61,7 +62,8 @@ class Rendering:
     rgb: Tensor
     """(..., 3) float32 in [0, 1], on a black background"""
     depth: Tensor
-    """(...,) float32 expected distance along the unit direction, of the part that is opaque; 0 where nothing is"""
+    """(...,) float32 mean distance along the unit direction of what stops the light, without the last of it; 0 where
+    nothing does"""
     opacity: Tensor
     """(...,) float32 in [0, 1]"""
 
@@ -84,10 +86,11 @@ def composite(sigmas: Tensor, rgbs: Tensor, samples: Samples) -> Rendering:
     """Eq. 1: sigmas (S,), rgbs (S, 3) -> Rendering of N rays, differentiable."""
     w = weights(sigmas, samples)
     mid = (samples.t_starts + samples.t_ends) / 2
-    values = torch.cat([rgbs, mid[:, None], torch.ones_like(mid)[:, None]], -1)
+    before = w / -torch.expm1(-sigmas * (samples.t_ends - samples.t_starts)).clamp(max=-1e-9)  # transmittance
+    lit = (before > _TRACE).to(w.dtype)
+    values = torch.cat([rgbs, torch.stack([lit * mid, lit, torch.ones_like(mid)], -1)], -1)
     summed = kernels.accumulate(w, values, samples.ray_offsets)
-    opacity = summed[:, 4]
-    return Rendering(summed[:, :3], summed[:, 3] / opacity.clamp_min(1e-6), opacity)
+    return Rendering(summed[:, :3], summed[:, 3] / summed[:, 4].clamp_min(1e-6), summed[:, 5])
 
 
 def interleaved(a: Samples, b: Samples) -> Samples:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -18,14 +18,22 @@ from refield.scene.camera import Camera
 
 
 class Made(Protocol):
-    """How a photo that is not there yet comes about."""
+    """How a photo that is not there yet comes about: from one that shows how things were."""
+
+    @property
+    def before(self) -> Any:
+        """The Field of what it shows."""
 
     def __call__(self, path: Path) -> None:
         """Write it."""
 
-    def at(self, camera: Camera, now: Tensor) -> Tensor:
+    def near(self, rays: Rays) -> Tensor:
+        """Which rays from its place pass by something that has another shape since, (N,) bool."""
+
+    def at(self, camera: Camera, was: Tensor, now: Tensor) -> Tensor:
         """The photo (H, W, 3) float32 in [0, 1] as its ``camera``, scaled down, would have taken it; nothing is
-        written. ``now``, of the same shape, is what the scene's field shows there; as in a photo, not all is so."""
+        written. ``was`` and ``now``, of the same shape, are what the fields of then and now show there; as in a photo,
+        not all is so."""
 
 
 @dataclass(frozen=True)

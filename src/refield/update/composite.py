@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from refield.field.nerfacto import NerfactoField
 from refield.field.outlook import Outlook
 from refield.field.radiance import Field, HashField
 from refield.field.render import visible_samples
@@ -120,7 +122,7 @@ class UpdatedField:
         self.sources = tuple(source_of(pretrained, m.grid) for m in self.moves)
         self.sampler_step = pretrained.sampler.step
         self.boxes = tuple(m.box_now for m in self._shells) + region.boxes + earlier.places.boxes
-        self._base: HashField | None = _base_of(pretrained)
+        self._base: HashField | NerfactoField | None = _base_of(pretrained)
         self._told, self._nothing = self._told_cells(pretrained.sampler)
         none = pretrained.sampler.grid.new_zeros(0, dtype=torch.long)
         self.unseen: Tensor = pretrained.unseen if isinstance(pretrained, UpdatedField) else none
@@ -145,6 +147,7 @@ class UpdatedField:
         out = copy(self)
         out.unseen = torch.cat([self.unseen, cells]).unique()
         out.sampler = out._without_unseen(self.sampler)
+        out.__dict__.pop("_unshown", None)
         return out
 
     def _without_unseen(self, sampler: OccupancySampler) -> OccupancySampler:
@@ -157,12 +160,29 @@ class UpdatedField:
         """Where to evaluate the field along rays; nothing behind the first opaque surface that never changed.
 
         Cells that changed at this visit or an earlier one are all looked at; elsewhere the field is that of the
-        first visit, and marching through its density network ends a ray.
+        first visit, and marching through its density network ends a ray, or its proposal networks say where to look:
+        behind what is no longer there, too (§10.1.2).
         """
         if self._base is None or not self._marched:
             return visible_samples(self.pretrained, rays, jitter) if not self.boxes else self.sampler(rays, jitter)
-        known, _ = self._split
-        return interleaved(known.visible(rays, self._base.density_net, jitter), self._retold_samples(rays, jitter))
+        if isinstance(self._base, NerfactoField):
+            known = self._base.samples(rays, jitter, without=self._changed.holds)
+            mid, d = known.positions(rays)
+            start = mid - d * ((known.t_ends - known.t_starts) / 2)[:, None]
+            # an interval that begins where a surface was seen may reach beneath it
+            known = known.only(~(self._unshown.holds(mid) & self._unshown.holds(start)))
+        else:
+            known = self._split[0].visible(rays, self._base.density_net, jitter)
+        return interleaved(known, self._retold_samples(rays, jitter))
+
+    @cached_property
+    def _changed(self) -> _Cells:
+        """Those in which the field of the first visit has nothing to say."""
+        return _Cells(self.sampler, self._retold.view(-1).nonzero()[:, 0])
+
+    @cached_property
+    def _unshown(self) -> _Cells:
+        return _Cells(self.sampler, self.unseen[self._told.view(-1)[self.unseen] == 0])
 
     @property
     def _split(self) -> tuple[OccupancySampler, OccupancySampler]:
@@ -297,6 +317,39 @@ class UpdatedField:
 
 
 @dataclass(frozen=True)
+class _Cells:
+    """Some of a sampler's cells."""
+
+    sampler: OccupancySampler
+    cells: Tensor
+    """(K,) flat indices"""
+
+    def holds(self, x: Tensor) -> Tensor:
+        """Whether each world point (S, 3) is in one of them, (S,) bool."""
+        near = inside_box(x, self._box).nonzero()[:, 0]
+        out = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+        out[near] = self._flags[self.sampler.cells(x[near])]
+        return out
+
+    @cached_property
+    def _flags(self) -> Tensor:
+        flags = self.sampler.grid.new_zeros(self.sampler.grid.numel(), dtype=torch.bool)
+        flags[self.cells] = True
+        return flags
+
+    @cached_property
+    def _box(self) -> Tensor:
+        """(2, 3) world, around them; the outermost go on for ever."""
+        x, r = self.sampler.points_in(self.cells, jitter=False), self.sampler.resolution
+        if len(x) == 0:
+            return x.new_full((2, 3), torch.nan)
+        ijk = torch.stack([self.cells // (r * r), self.cells // r % r, self.cells % r], -1)
+        low, high = _by_cells(self.sampler, torch.stack([x.amin(0), x.amax(0)]))
+        low = torch.where(ijk.amin(0) == 0, -torch.inf, low)
+        return torch.stack([low, torch.where(ijk.amax(0) == r - 1, torch.inf, high)])
+
+
+@dataclass(frozen=True)
 class _Sourced:
     """Points that an object's source answers for."""
 
@@ -372,11 +425,11 @@ def _part(change: SceneChange, without: frozenset[int]) -> SceneChange:
     return change if len(kept) == len(change.objects) else replace(change, objects=kept)
 
 
-def _base_of(field: Field) -> HashField | None:
-    """The hash field of the first visit, if that is what lies at the bottom."""
+def _base_of(field: Field) -> HashField | NerfactoField | None:
+    """The field of the first visit, if it is one of those that know where to look."""
     if isinstance(field, UpdatedField):
         return field._base
-    return field if isinstance(field, HashField) else None
+    return field if isinstance(field, HashField | NerfactoField) else None
 
 
 def _by_cells(sampler: OccupancySampler, box: Tensor) -> Tensor:
