@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from refield.estimate.look import Seen, shaded
+from refield.estimate.look import Seen, near_to_far, shaded
 from refield.estimate.objects import Old
 from refield.field.radiance import Field
 from refield.field.sampling import OccupancySampler
@@ -45,12 +45,15 @@ def object_alone(
     there = there[hit]
     sampler = sampler_around(field, old) if sampler is None else sampler
     end = float(far[hit].max()) / sampler.contraction.radius  # beyond it there is nothing to look for
-    samples = replace(sampler, far=min(end, sampler.far))(there)
-    x, d = samples.positions(there)
-    own = grid.contains(x) if old.source is None else grid.contains(x) & old.source.grid.contains(x)
-    keep = own.nonzero()[:, 0]
     asked, along = (field, old.outlook.held) if old.source is None else (old.source, None)
+
+    def density(x: Tensor) -> Tensor:
+        own = grid.contains(x) if old.source is None else grid.contains(x) & old.source.grid.contains(x)
+        mine = own.nonzero()[:, 0]
+        return x.new_zeros(len(x)).index_copy(0, mine, asked.density(x[mine]))
+
     with torch.no_grad():
-        seen = shaded(asked, (x[keep], d[keep]), asked.density(x[keep]), samples.only(keep), along)
+        samples, sigmas = near_to_far(density, replace(sampler, far=min(end, sampler.far))(there), there)
+        seen = shaded(asked, samples.positions(there), sigmas, samples, along)
     rgb[hit], depth[hit], opacity[hit] = seen.rgb, seen.depth, seen.opacity
     return Seen(rgb, depth, opacity)

@@ -67,6 +67,8 @@ class AssociateConfig:
     """part of a newcomer's pixels that nothing else explains"""
     newcomer: float = 0.01
     """part of a photo that something new must fill in at least one of them (the paper's contour area, §10.2.2)"""
+    crumb: float = 0.003
+    """part of a photo that an object which was overlooked at first must fill in at least one of them"""
     trim: float = 0.03
     """part of an object's voxels that the new photos or the ground deny, from which on it is trimmed"""
     core: float = 0.25
@@ -162,6 +164,11 @@ def unexplained(ground: Ground, settled: Settled, part: Voxels) -> bool:
         shown += int(here.sum())
         left += int((here & p.changed.mask & ~p.explained & ~pixels.dilate(came, 2)).sum())
     return left > ground.believe.touched * shown
+
+
+def is_crumb(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
+    """Whether an object fills so little of every photo that it is rather the edge of something else."""
+    return max(float(silhouette(c.view, old).mean()) for c in changed) < ground.believe.crumb
 
 
 def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:

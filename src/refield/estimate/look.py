@@ -105,14 +105,18 @@ def _see(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
         samples = visible_samples(field, rays)
         at = samples.positions(rays)
         return shaded(field, at, field.density(at[0]), samples)
-    samples, sigmas = _in_front(field, rays, hidden)
+
+    def density(x: Tensor) -> Tensor:
+        left = (~hidden(x)).nonzero()[:, 0]
+        return x.new_zeros(len(x)).index_copy(0, left, field.density(x[left]))
+
+    samples, sigmas = near_to_far(density, field.sampler(rays), rays)
     return shaded(field, samples.positions(rays), sigmas, samples)
 
 
-def _in_front(field: Field, rays: Rays, hidden: Hidden) -> tuple[Samples, Tensor]:
-    """Samples of rays and their densities without what is hidden, near to far, some at a time, until a ray has ended:
-    most of what a field holds lies behind its surfaces."""
-    every = field.sampler(rays)
+def near_to_far(density: Callable[[Tensor], Tensor], every: Samples, rays: Rays) -> tuple[Samples, Tensor]:
+    """Those of the samples that light reaches, and their densities (S,); asked for some at a time, until a ray has
+    ended: most of what a field holds lies behind its surfaces."""
     first, count = every.ray_offsets[:-1], every.ray_offsets.diff()
     sigmas, depth = torch.zeros(len(every.t_starts)), torch.zeros(len(rays))
     asked = torch.zeros(len(sigmas), dtype=torch.bool)
@@ -122,9 +126,7 @@ def _in_front(field: Field, rays: Rays, hidden: Hidden) -> tuple[Samples, Tensor
         there = some < count[ray, None]
         rows, of = (first[ray, None] + some)[there], ray[:, None].expand(-1, _AT_ONCE)[there]
         t0, t1 = every.t_starts[rows], every.t_ends[rows]
-        x = rays.origins[of] + rays.directions[of] * ((t0 + t1) / 2)[:, None]
-        left = (~hidden(x)).nonzero()[:, 0]
-        sigmas[rows[left]] = field.density(x[left])
+        sigmas[rows] = density(rays.origins[of] + rays.directions[of] * ((t0 + t1) / 2)[:, None])
         asked[rows] = True
         depth.index_add_(0, of, sigmas[rows] * (t1 - t0))
         begin += _AT_ONCE

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from refield.estimate import associate, detect, hull, light, look
-from refield.estimate.associate import AssociateConfig, Ground, Settled, looks_gone, unexplained
+from refield.estimate.associate import AssociateConfig, Ground, Settled, is_crumb, looks_gone, unexplained
 from refield.estimate.conclude import Told, concluded, disagreeing
 from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.faces import changed_parts
@@ -259,7 +259,11 @@ def _overlooked(
     for part in others:
         needed = unexplained(ground, settled, part)
         if needed or part.sum() >= least:
-            found = _were_there(scene, ground.hull, [part], [*known, *more])
+            found = [
+                o
+                for o in _were_there(scene, ground.hull, [part], [*known, *more])
+                if not is_crumb(ground, scene.changed, o)
+            ]
             more += [old for old in found if needed or looks_gone(ground, scene.changed, old)]
     return more
 
