@@ -9,6 +9,8 @@ from refield.history import known_objects, retouched, untouched_psnr
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.images import frame_image, scaled_image
 from refield.update.composite import UpdatedField
+from refield.update.light import Relighting
+from refield.update.region import Region
 from tests.captures import write_capture
 from tests.fields import small_field
 from tests.update.worlds import Ball, BallWorld, at, change_of, grid_of
@@ -74,3 +76,23 @@ def test_a_picture_may_be_smaller_than_its_photo(tmp_path):
             picture[: seen.height // 2 + 1] += 0.5
             picture[seen.height // 2 + 1 :] += 0.1
         assert abs(untouched_psnr(pictures, frames, masks) - 20) < 1e-3
+
+
+def test_photos_are_out_of_date_where_only_the_light_changed(tmp_path):
+    """An object was put back: nothing has another shape, but the light has changed."""
+    capture, scratch = write_capture(tmp_path / "data", 1), tmp_path / "scratch"
+    scratch.mkdir()
+    old = BallWorld((Ball(at(0.0, 0.0, 0.25), 0.25),))
+    light = Relighting(torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.full((3, 3, 3, 3), -0.7))
+    now = UpdatedField(old, SceneChange(()), region=Region(()), light=light)
+    assert not now.boxes
+    later = retouched(capture, old, now, scratch)
+    frame, was = later.frames[0], capture.frames[0]
+    image, photo = frame_image(frame).float() / 255, frame_image(was).float() / 255
+    shown = [render_camera(f, was.camera, was.world_from_cam).rgb for f in (old, now)]
+    darker = (shown[0] - shown[1]).amax(-1) > 0.05
+    assert darker.any()
+    assert float((image - shown[1])[darker].abs().amax()) < 0.01
+    pixels = was.camera.width * was.camera.height
+    view = view_of(now, frame, pixels)  # as taken: the photo and the picture beside it in the old light
+    assert np.allclose(view.photo, photo.numpy(), atol=1e-5) and np.allclose(view.rgb, shown[0].numpy(), atol=2e-3)

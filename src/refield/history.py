@@ -74,7 +74,7 @@ def retouched(capture: Capture, before: Field, now: Field, folder: Path) -> Capt
     """
     shapes = tuple(box for update in layers_of(now) for box in update.boxes)
     lights = tuple(update.light.aabb for update in layers_of(now) if update.light is not None)
-    if not shapes:
+    if not shapes and not lights:
         return capture
 
     def one(frame: Frame, name: str) -> Frame:
@@ -125,7 +125,10 @@ class _Retouched:
 
 def _through(rays: Rays, boxes: Sequence[Tensor]) -> Tensor:
     """Which rays cross any of some world boxes (2, 3), (N,) bool."""
-    return torch.stack([leaving(rays, box) for box in boxes]).amax(0) > 0
+    out = torch.zeros(len(rays), dtype=torch.bool)
+    for box in boxes:
+        out |= leaving(rays, box) > 0
+    return out
 
 
 def _differs(was: Tensor, now: Tensor) -> Tensor:

@@ -1,11 +1,13 @@
 """Carving with oracle masks returns the object; planes that hold things up are found and nothing else."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from refield.estimate import associate
 from refield.estimate.detect import Changed
 from refield.estimate.hull import HullConfig, find_region
 from refield.estimate.lattice import Lattice, components
@@ -77,3 +79,17 @@ def test_a_view_finds_its_own_surface_again(views):
     assert inside[seen].all()
     assert view.lookup(view.depth, uv, inside)[i[0], j[0]] == view.depth[i[0], j[0]]
     assert replace(view, depth=view.depth).surface.shape == (*view.shape, 3)
+
+
+@pytest.mark.parametrize(("seen", "crumb"), [((2, 0), True), ((2, 5), False)])
+def test_a_crumb_is_small_in_every_photo(monkeypatch, seen, crumb):
+    sizes = iter(seen)
+
+    def silhouette(view, old):
+        mask = np.zeros((10, 100), bool)
+        mask[0, : next(sizes)] = True
+        return mask
+
+    monkeypatch.setattr(associate, "silhouette", silhouette)
+    photos = [SimpleNamespace(view=None)] * 2
+    assert associate.is_crumb(photos, None, 0.003) is crumb

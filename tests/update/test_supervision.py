@@ -105,6 +105,9 @@ def test_of_a_large_photo_some_pixels_teach(tmp_path: Path, monkeypatch: pytest.
     masks[1][:, 10:20] = True
     lessons = new_lessons(frames, BallWorld((BALL,)), masks)
     assert [int((lessons.photo == i).sum()) for i in range(2)] == [500, 500]
+    small = write_capture(tmp_path / "small", 1, camera.scaled(16, 12)).frames
+    mixed = new_lessons((*frames, *small), BallWorld((BALL,)), [*masks, np.zeros((12, 16), bool)])
+    assert [int((mixed.photo == i).sum()) for i in range(3)] == [500, 500, 16 * 12], "each on its own"
     u = lessons.place % camera.width
     assert torch.equal(lessons.within(masks), (lessons.photo == 1) & (u >= 10) & (u < 20))
     for i, frame in enumerate(frames):

@@ -33,7 +33,7 @@ from refield.update.train import update_field
 from refield.workspace import Workspace
 
 SHOWN = 256 * 256
-"""pixels of a picture that a field has of a new photo, at most; an update is judged by it, and the page shows it"""
+"""pixels, about and at most, of what a field shows of a new photo; an update is judged by it, and the page shows it"""
 MOST_LOST = 0.2
 """dB that the unchanged pixels of the new photos may lose before an update is refused"""
 
@@ -144,7 +144,7 @@ def _updated(
 
 
 def _shown(field: Field, change: SceneChange) -> list[Tensor]:
-    """What a field shows from where each used new photo was taken, (H, W, 3) each, no larger than `SHOWN`."""
+    """What a field shows from where each used new photo was taken, (H, W, 3) each, of about `SHOWN` pixels at most."""
     return [render_camera(field, f.camera.within(SHOWN), f.world_from_cam).rgb for f in change.frames]
 
 

@@ -166,9 +166,9 @@ def unexplained(ground: Ground, settled: Settled, part: Voxels) -> bool:
     return left > ground.believe.touched * shown
 
 
-def is_crumb(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
-    """Whether an object fills so little of every photo that it is rather the edge of something else."""
-    return max(float(silhouette(c.view, old).mean()) for c in changed) < ground.believe.crumb
+def is_crumb(changed: Sequence[Changed], old: Old, least: float) -> bool:
+    """Whether an object fills less than this part of every photo: it is rather the edge of something else."""
+    return max(float(silhouette(c.view, old).mean()) for c in changed) < least
 
 
 def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:

@@ -241,13 +241,17 @@ class View:
 
 
 def view_of(radiance: Field, frame: Frame, max_pixels: int) -> View:
-    """Load one photo and render the old field beside it."""
+    """Load one photo and render the old field beside it.
+
+    A photo that is not there yet shows what ``radiance`` does where a thing has another shape since, and elsewhere,
+    light included, is as it was taken; so is the picture beside it.
+    """
     camera, made = frame.camera.within(max_pixels), frame.made
     rays, shape = camera_rays(camera, frame.world_from_cam), (camera.height, camera.width)
     if made is None:
         seen = see(radiance, rays)
         photo = scaled_image(frame, camera)
-    else:  # where only light has changed since, the photo goes with the field that it was taken for, which is faster
+    else:  # the field that a photo was taken for is the faster one
         was, near = see(made.before, rays), made.near(rays).nonzero()[:, 0]
         seen = was.with_rows(near, see(radiance, rays[near]))
         photo = made.at(camera, *(s.rgb.reshape(*shape, 3).clamp(0, 1) for s in (was, seen)))

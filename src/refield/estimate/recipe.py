@@ -251,7 +251,8 @@ def _overlooked(
 ) -> list[Old]:
     """Objects that look like what a newcomer hides, since they go on outside of the changed pixels, and yet left.
 
-    What they would explain is explained by nothing else, or the photos show what was behind them.
+    What they would explain is explained by nothing else, or the photos show what was behind them. Crumbs are none,
+    unless an earlier visit knows them.
     """
     things, others = parts
     least = 0.15 * max(float(p.sum()) for p in (*things, *others))
@@ -259,11 +260,8 @@ def _overlooked(
     for part in others:
         needed = unexplained(ground, settled, part)
         if needed or part.sum() >= least:
-            found = [
-                o
-                for o in _were_there(scene, ground.hull, [part], [*known, *more])
-                if not is_crumb(ground, scene.changed, o)
-            ]
+            found = _were_there(scene, ground.hull, [part], [*known, *more])
+            found = [o for o in found if o.remembered or not is_crumb(scene.changed, o, ground.believe.crumb)]
             more += [old for old in found if needed or looks_gone(ground, scene.changed, old)]
     return more
 

@@ -77,7 +77,7 @@ class NerfactoConfig:
     occupancy: int = 128
     """cells a side of the occupancy grid for those who march through the field instead of proposing"""
     step: float = 1 / 192
-    """length of a sample for them, core radii: several of the finest cells"""
+    """length of a sample for them, core radii"""
 
 
 class NerfactoField(nn.Module):

@@ -63,12 +63,15 @@ class PixelBank:
 
     def place_of(self, pixels: Tensor) -> Tensor:
         """Each pixel's place in its photo, row by row, (B,) -> (B,) int64."""
-        return pixels - self.starts[self.frame_of(pixels)] if self.places is None else self.places[pixels].long()
+        return self._place_of(pixels, self.frame_of(pixels))
+
+    def _place_of(self, pixels: Tensor, owner: Tensor) -> Tensor:
+        return pixels - self.starts[owner] if self.places is None else self.places[pixels].long()
 
     def rays(self, pixels: Tensor) -> Rays:
         """World rays through pixel centres, (B,) -> Rays of B."""
         owner = self.frame_of(pixels)
-        local = self.place_of(pixels)
+        local = self._place_of(pixels, owner)
         d = torch.empty(len(pixels), 3)
         for k, camera in enumerate(self._cameras):
             mine = slice(None) if len(self._cameras) == 1 else (self._camera_of[owner] == k).nonzero()[:, 0]

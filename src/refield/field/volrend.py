@@ -62,8 +62,8 @@ class Rendering:
     rgb: Tensor
     """(..., 3) float32 in [0, 1], on a black background"""
     depth: Tensor
-    """(...,) float32 mean distance along the unit direction of what stops the light, without the last of it; 0 where
-    nothing does"""
+    """(...,) float32 mean distance along the unit direction of what stops the light, but for the last 5 % of it; 0
+    where nothing does. A surface's, where nearly all is stopped there."""
     opacity: Tensor
     """(...,) float32 in [0, 1]"""
 

@@ -43,7 +43,7 @@ class Camera:
         return self.scaled(max(round(self.width * part), 1), max(round(self.height * part), 1))
 
     def within(self, most: int) -> Camera:
-        """The same lens on a sensor of at most so many pixels; itself if it has no more."""
+        """The same lens on a sensor of about so many pixels; of its own, if they are no more."""
         return self.shrunk(min(1.0, (most / (self.width * self.height)) ** 0.5))
 
     def scaled(self, width: int, height: int) -> Camera:

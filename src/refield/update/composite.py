@@ -339,14 +339,14 @@ class _Cells:
 
     @cached_property
     def _box(self) -> Tensor:
-        """(2, 3) world, around them; the outermost go on for ever."""
+        """(2, 3) world, around them; the outermost go on for ever, and widen."""
         x, r = self.sampler.points_in(self.cells, jitter=False), self.sampler.resolution
         if len(x) == 0:
             return x.new_full((2, 3), torch.nan)
         ijk = torch.stack([self.cells // (r * r), self.cells // r % r, self.cells % r], -1)
-        low, high = _by_cells(self.sampler, torch.stack([x.amin(0), x.amax(0)]))
-        low = torch.where(ijk.amin(0) == 0, -torch.inf, low)
-        return torch.stack([low, torch.where(ijk.amax(0) == r - 1, torch.inf, high)])
+        if bool(((ijk == 0) | (ijk == r - 1)).any()):
+            return x.new_tensor([[-torch.inf] * 3, [torch.inf] * 3])
+        return _by_cells(self.sampler, torch.stack([x.amin(0), x.amax(0)]))
 
 
 @dataclass(frozen=True)

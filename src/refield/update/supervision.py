@@ -151,7 +151,7 @@ def new_lessons(frames: Sequence[Frame], field: Field, changed: Sequence[np.ndar
 
     ``field`` is the old one with the objects cut out and moved, ``changed`` each photo's `changed_pixels`.
     """
-    bank = PixelBank(frames, most=_PIXELS * len(frames))
+    bank = PixelBank(frames, masks=[_thinned(f) for f in frames])
     everything = torch.arange(len(bank))
     out = Lessons(bank.rays(everything), bank.colours(everything), bank.frame_of(everything), bank.place_of(everything))
     wide = [dilate(mask, math.ceil(_UNTOUCHED_MARGIN * mask.shape[1])) for mask in changed]
@@ -163,6 +163,16 @@ def new_lessons(frames: Sequence[Frame], field: Field, changed: Sequence[np.ndar
         affine = exposure(out.rgb[some], render_many(field, out.rays[some]).rgb)
         out.rgb[mine] = (out.rgb[mine] * affine[0] + affine[1]).clamp(0, 1)
     return out
+
+
+def _thinned(frame: Frame) -> Tensor | None:
+    """(H, W) bool, `_PIXELS` of a photo's pixels at random; None if it has no more."""
+    h, w = frame.camera.height, frame.camera.width
+    if h * w <= _PIXELS:
+        return None
+    kept = torch.zeros(h * w, dtype=torch.bool)
+    kept[torch.randperm(h * w, generator=torch.Generator().manual_seed(0))[:_PIXELS]] = True
+    return kept.reshape(h, w)
 
 
 def exposure(photo: Tensor, rendered: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ from refield.vision.pixels import dilate
 DEFAULTS = UpdateConfig()
 _PATCHES, _FOLDS, _SHADING_CELLS = 8, 4, 24  # an object's side in patches that are left out together; in cells
 _LIT_RAYS = 60_000  # of the new photos, for the light on all and on each object; a lattice of factors is no finer
-_NEW_RAYS = 1 << 18  # of the new photos, through the region; more than training draws
+_NEW_RAYS = 1 << 18  # of the new photos, through the region; about as many as training draws
 _MADE = 20  # of the old photos that an earlier visit put out of date; each takes longer to put right than to learn from
 _GROUND_RAYS = 12_000  # that planes are looked for along
 _RING_ASKED = 1 << 20  # of the old photos' pixels, whether their rays meet the region
