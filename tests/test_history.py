@@ -23,8 +23,8 @@ def test_old_photos_are_brought_up_to_date_when_they_are_looked_at(tmp_path):
     now = UpdatedField(old, change_of(ObjectChange("removed", grid_of(ball))))
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    assert retouched(capture, old, old, scratch) is capture
-    later = retouched(capture, old, now, scratch)
+    assert retouched(capture, old, scratch) is capture
+    later = retouched(capture, now, scratch)
     assert not list(scratch.iterdir())
     frame, was = later.frames[1], capture.frames[1]
     image, photo = frame_image(frame).float() / 255, frame_image(was).float() / 255
@@ -86,7 +86,7 @@ def test_photos_are_out_of_date_where_only_the_light_changed(tmp_path):
     light = Relighting(torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.full((3, 3, 3, 3), -0.7))
     now = UpdatedField(old, SceneChange(()), region=Region(()), light=light)
     assert not now.boxes
-    later = retouched(capture, old, now, scratch)
+    later = retouched(capture, now, scratch)
     frame, was = later.frames[0], capture.frames[0]
     image, photo = frame_image(frame).float() / 255, frame_image(was).float() / 255
     shown = [render_camera(f, was.camera, was.world_from_cam).rgb for f in (old, now)]

@@ -18,11 +18,12 @@ from refield.artefacts import TENSORS
 from refield.field.radiance import Field
 from refield.field.render import render_many
 from refield.field.source import Known
+from refield.field.warp import crosses
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
 from refield.scene.images import frame_image, scaled_image, write_image
-from refield.update.composite import UpdatedField, layers_of, leaving, source_of
+from refield.update.composite import UpdatedField, layers_of, source_of
 from refield.update.store import load_updated
 from refield.workspace import Workspace
 
@@ -66,16 +67,18 @@ def _grids_now(now: Field) -> list[OccupancyGrid]:
     return known
 
 
-def retouched(capture: Capture, before: Field, now: Field, folder: Path) -> Capture:
+def retouched(capture: Capture, now: Field, folder: Path) -> Capture:
     """The capture as if taken ``now``: where the photos show what has changed since, the field's own stand.
 
-    The photos are from ``before``; an update must not learn from them what an earlier visit has put right. Each is
+    The photos are from before any visit; an update must not learn from them what an earlier one has put right. Each is
     written as a PNG into ``folder`` when it is first looked at: few are, where every object is known.
     """
-    shapes = tuple(box for update in layers_of(now) for box in update.boxes)
-    lights = tuple(update.light.aabb for update in layers_of(now) if update.light is not None)
+    updates = list(layers_of(now))
+    shapes = tuple(box for update in updates for box in update.boxes)
+    lights = tuple(update.light.aabb for update in updates if update.light is not None)
     if not shapes and not lights:
         return capture
+    before = updates[-1].pretrained
 
     def one(frame: Frame, name: str) -> Frame:
         return replace(frame, path=folder / name, made=_Retouched(frame, before, now, shapes, lights))
@@ -102,7 +105,7 @@ class _Retouched:
         part = min(max(1 / _COARSE, _LEAST / min(frame.camera.width, frame.camera.height)), 1.0)
         coarse = frame.camera.shrunk(part)
         rays = camera_rays(coarse, frame.world_from_cam)
-        near = _through(rays, self.shapes + self.lights).nonzero()[:, 0]
+        near = crosses(rays, self.shapes + self.lights).nonzero()[:, 0]
         was, now = torch.zeros(2, coarse.height, coarse.width, 3)
         for field, shown in ((self.before, was), (self.now, now)):
             shown.view(-1, 3)[near] = render_many(field, rays[near]).rgb
@@ -114,21 +117,13 @@ class _Retouched:
 
     def near(self, rays: Rays) -> Tensor:
         """See `Made`."""
-        return _through(rays, self.shapes)
+        return crosses(rays, self.shapes)
 
     def at(self, camera: Camera, was: Tensor, now: Tensor) -> Tensor:
         """See `Made`."""
         image = scaled_image(self.frame, camera)
         # not a picture without error: what the field gets wrong in photos is learnt from these
         return torch.where(_differs(was, now)[..., None] > 0.5, (now + image - was).clamp(0, 1), image)
-
-
-def _through(rays: Rays, boxes: Sequence[Tensor]) -> Tensor:
-    """Which rays cross any of some world boxes (2, 3), (N,) bool."""
-    out = torch.zeros(len(rays), dtype=torch.bool)
-    for box in boxes:
-        out |= leaving(rays, box) > 0
-    return out
 
 
 def _differs(was: Tensor, now: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.evaluate import Report, evaluate
 from refield.field.radiance import Field
 from refield.field.render import render_camera
-from refield.history import changed_visits, known_objects, retouched, state, untouched_psnr
+from refield.history import known_objects, retouched, state, untouched_psnr
 from refield.photos.taken import PhotoConfig
 from refield.report import summary, write_report
 from refield.scene.capture import Capture
@@ -100,8 +100,7 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         clock.stage("load the field")
         number = workspace.visits
         old = state(workspace, number)
-        if changed_visits(workspace, number):
-            capture = retouched(capture, workspace.field(), old, Path(scratch))
+        capture = retouched(capture, old, Path(scratch))
         known = known_objects(old)
         change = estimate_change(
             capture, old, frames, options.estimate, on_stage=clock.stage, models=models, known=known

@@ -20,7 +20,7 @@ from refield.field.radiance import Field
 from refield.field.render import visible_samples
 from refield.field.sampling import STOP
 from refield.field.volrend import Samples, composite, weights
-from refield.field.warp import crossing, outline
+from refield.field.warp import crosses, outline
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
@@ -54,11 +54,7 @@ class Hidden:
 
     def meets(self, rays: Rays) -> Tensor:
         """Whether each ray crosses a box around what is hidden, (N,) bool."""
-        out = torch.zeros(len(rays), dtype=torch.bool)
-        for box in self._boxes:
-            near, far = crossing(rays, box)
-            out |= far > near
-        return out
+        return crosses(rays, self._boxes)
 
 
 @dataclass(frozen=True)

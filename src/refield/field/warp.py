@@ -6,6 +6,7 @@ asks at ``old_from_new @ x``, along the direction turned back by the same rotati
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -102,6 +103,15 @@ def outline(grid: OccupancyGrid) -> Tensor:
 def inside_box(x: Tensor, box: Tensor) -> Tensor:
     """World points (..., 3), world box (2, 3) -> (...,) bool."""
     return in_boxes(x.reshape(-1, 3), box[None]).reshape(x.shape[:-1])
+
+
+def crosses(rays: Rays, boxes: Iterable[Tensor]) -> Tensor:
+    """Whether each of N rays crosses any of some world boxes (2, 3), (N,) bool."""
+    out = torch.zeros(len(rays), dtype=torch.bool, device=rays.origins.device)
+    for box in boxes:
+        enter, leave = crossing(rays, box)
+        out |= leave > enter
+    return out
 
 
 def crossing(rays: Rays, box: Tensor) -> tuple[Tensor, Tensor]:

@@ -78,7 +78,7 @@ def _in_boxes(x: _Array, boxes: _Array, out: _Array) -> None:
 
 
 @njit(**_JIT)
-def _cell(x: float, low: float, high: float, nodes: int) -> tuple[int, float]:
+def cell_along(x: float, low: float, high: float, nodes: int) -> tuple[int, float]:
     """Along one axis: the node below a place, and the part of the way to the next; node -1 outside."""
     at = (x - low) / (high - low) * (nodes - 1)
     if not (at >= 0 and at <= nodes - 1):
@@ -90,9 +90,9 @@ def _cell(x: float, low: float, high: float, nodes: int) -> tuple[int, float]:
 @njit(**_JIT)
 def _above(values: _Array, aabb: _Array, level: float, x: float, y: float, z: float) -> bool:
     """Whether the trilinear value at a place is above a level; False outside."""
-    i, u = _cell(x, aabb[0, 0], aabb[1, 0], values.shape[0])
-    j, v = _cell(y, aabb[0, 1], aabb[1, 1], values.shape[1])
-    k, w = _cell(z, aabb[0, 2], aabb[1, 2], values.shape[2])
+    i, u = cell_along(x, aabb[0, 0], aabb[1, 0], values.shape[0])
+    j, v = cell_along(y, aabb[0, 1], aabb[1, 1], values.shape[1])
+    k, w = cell_along(z, aabb[0, 2], aabb[1, 2], values.shape[2])
     if i < 0 or j < 0 or k < 0:
         return False
     near = (values[i, j, k] * (1 - w) + values[i, j, k + 1] * w) * (1 - v)

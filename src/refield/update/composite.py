@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -147,7 +146,6 @@ class UpdatedField:
         out = copy(self)
         out.unseen = torch.cat([self.unseen, cells]).unique()
         out.sampler = out._without_unseen(self.sampler)
-        out.__dict__.pop("_unshown", None)
         return out
 
     def _without_unseen(self, sampler: OccupancySampler) -> OccupancySampler:
@@ -166,23 +164,22 @@ class UpdatedField:
         if self._base is None or not self._marched:
             return visible_samples(self.pretrained, rays, jitter) if not self.boxes else self.sampler(rays, jitter)
         if isinstance(self._base, NerfactoField):
-            known = self._base.samples(rays, jitter, without=self._changed.holds)
+            known = self._base.samples(rays, jitter, without=replace(self.sampler, grid=self._retold).occupied)
             mid, d = known.positions(rays)
             start = mid - d * ((known.t_ends - known.t_starts) / 2)[:, None]
             # an interval that begins where a surface was seen may reach beneath it
-            known = known.only(~(self._unshown.holds(mid) & self._unshown.holds(start)))
+            unshown = self._unshown
+            known = known.only(~(unshown.occupied(mid) & unshown.occupied(start)))
         else:
             known = self._split[0].visible(rays, self._base.density_net, jitter)
         return interleaved(known, self._retold_samples(rays, jitter))
 
-    @cached_property
-    def _changed(self) -> _Cells:
-        """Those in which the field of the first visit has nothing to say."""
-        return _Cells(self.sampler, self._retold.view(-1).nonzero()[:, 0])
-
-    @cached_property
-    def _unshown(self) -> _Cells:
-        return _Cells(self.sampler, self.unseen[self._told.view(-1)[self.unseen] == 0])
+    @property
+    def _unshown(self) -> OccupancySampler:
+        """Looks into the cells alone that are not shown."""
+        grid = torch.zeros_like(self.sampler.grid)
+        grid.view(-1)[self.unseen] = 1 - self._told.view(-1)[self.unseen]
+        return replace(self.sampler, grid=grid)
 
     @property
     def _split(self) -> tuple[OccupancySampler, OccupancySampler]:
@@ -314,39 +311,6 @@ class UpdatedField:
                 mine = (owner == i).nonzero()[:, 0]
                 rgb = rgb.index_copy(0, mine, light.applied(asked[mine], rgb[mine]))
         return rgb
-
-
-@dataclass(frozen=True)
-class _Cells:
-    """Some of a sampler's cells."""
-
-    sampler: OccupancySampler
-    cells: Tensor
-    """(K,) flat indices"""
-
-    def holds(self, x: Tensor) -> Tensor:
-        """Whether each world point (S, 3) is in one of them, (S,) bool."""
-        near = inside_box(x, self._box).nonzero()[:, 0]
-        out = torch.zeros(len(x), dtype=torch.bool, device=x.device)
-        out[near] = self._flags[self.sampler.cells(x[near])]
-        return out
-
-    @cached_property
-    def _flags(self) -> Tensor:
-        flags = self.sampler.grid.new_zeros(self.sampler.grid.numel(), dtype=torch.bool)
-        flags[self.cells] = True
-        return flags
-
-    @cached_property
-    def _box(self) -> Tensor:
-        """(2, 3) world, around them; the outermost go on for ever, and widen."""
-        x, r = self.sampler.points_in(self.cells, jitter=False), self.sampler.resolution
-        if len(x) == 0:
-            return x.new_full((2, 3), torch.nan)
-        ijk = torch.stack([self.cells // (r * r), self.cells // r % r, self.cells % r], -1)
-        if bool(((ijk == 0) | (ijk == r - 1)).any()):
-            return x.new_tensor([[-torch.inf] * 3, [torch.inf] * 3])
-        return _by_cells(self.sampler, torch.stack([x.amin(0), x.amax(0)]))
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from refield.field.kernels.cpu.simd import JIT
 from refield.field.warp import inside_box
+from refield.scene.inside import cell_along
 
 _Array = NDArray[Any]
 
@@ -77,15 +78,11 @@ def _relight(x: _Array, aabb: _Array, log_gain: _Array, rgb: _Array) -> None:
     """`Relighting.applied`, in place."""
     nx, ny, nz = log_gain.shape[:3]
     for s in prange(len(x)):
-        p, q, r = x[s, 0], x[s, 1], x[s, 2]
-        inside = p >= aabb[0, 0] and p <= aabb[1, 0] and q >= aabb[0, 1] and q <= aabb[1, 1]
-        if not (inside and r >= aabb[0, 2] and r <= aabb[1, 2]):
+        i, u = cell_along(x[s, 0], aabb[0, 0], aabb[1, 0], nx)
+        j, v = cell_along(x[s, 1], aabb[0, 1], aabb[1, 1], ny)
+        k, w = cell_along(x[s, 2], aabb[0, 2], aabb[1, 2], nz)
+        if i < 0 or j < 0 or k < 0:
             continue
-        p = (p - aabb[0, 0]) / (aabb[1, 0] - aabb[0, 0]) * (nx - 1)
-        q = (q - aabb[0, 1]) / (aabb[1, 1] - aabb[0, 1]) * (ny - 1)
-        r = (r - aabb[0, 2]) / (aabb[1, 2] - aabb[0, 2]) * (nz - 1)
-        i, j, k = min(int(p), nx - 2), min(int(q), ny - 2), min(int(r), nz - 2)
-        u, v, w = p - i, q - j, r - k
         for c in range(3):
             total = np.float32(0)
             for corner in range(8):

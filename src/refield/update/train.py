@@ -15,12 +15,12 @@ from refield.field.pixels import PixelBank
 from refield.field.radiance import Field
 from refield.field.render import render_many
 from refield.field.sampling import OccupancySampler
-from refield.field.warp import outline
+from refield.field.warp import crosses, outline
 from refield.scene.capture import Capture, Frame, Rays, centres
 from refield.scene.change import SceneChange
 from refield.scene.pose import transform
 from refield.update.bare import bare_skin
-from refield.update.composite import UpdatedField, leaving
+from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.evidence import as_remembered, recalled_pixels
 from refield.update.fit_helper import HelperTraining, Lit, UpdateProgress
@@ -181,7 +181,7 @@ def _light(known: _Known) -> Relighting | None:
     box = torch.stack([box[0] - 1.5 * side, box[1] + 1.5 * side])
     unknown = [c & ~r for c, r in zip(known.changed, known.recalled)]
     still = ~sparse.within([dilate(c, math.ceil(0.01 * c.shape[1])) for c in unknown])
-    may = (still & (leaving(sparse.rays, box) > 0)).nonzero()[:, 0]
+    may = (still & crosses(sparse.rays, [box])).nonzero()[:, 0]
     seen = sparse[_some(may, _LIT_RAYS)]
     was = render_many(known.cut, seen.rays)
     x = seen.rays.origins + seen.rays.directions * was.depth[:, None]
@@ -253,7 +253,7 @@ def _ground(known: _Known, old: Lessons, wide: Region, eyes: Tensor, resolved: f
     the new ones that pass nearby."""
     cut, shown, rays = known.cut, known.cut.pretrained, old.rays
     if len(rays) == 0:
-        near = torch.stack([leaving(known.sparse.rays, b) for b in _beside(wide)]).amax(0) > 0
+        near = crosses(known.sparse.rays, _beside(wide))
         shown, rays = cut, known.sparse.rays[near.nonzero()[:, 0]]
     rays = rays[torch.randperm(len(rays))[:_GROUND_RAYS]]
     points = rays.origins + rays.directions * render_many(shown, rays).depth[:, None]
