@@ -35,10 +35,19 @@ def test_only_what_several_cameras_see_may_be_before_one() -> None:
     assert allowed(ring, 0.0, 0.0, 5.0)  # nobody sees it: nothing is decided
 
 
+def test_what_is_among_the_cameras_but_in_few_pictures_is_nothing() -> None:
+    ring = tuple(camera_on_a_ring(0.2 * k) for k in range(5))
+    ring_and_opposite = (*ring, camera_on_a_ring(3.2), camera_on_a_ring(3.3))
+    beside = (1.5, 0.0, 0.5)  # 0.7 before the first camera, above its picture; the two opposite see it
+    assert not allowed(ring_and_opposite, *beside)
+    assert allowed((*ring_and_opposite, camera_on_a_ring(3.1)), *beside)  # a third does
+    assert allowed(ring_and_opposite, 1.5, 0.0, 0.8)  # not as near
+
+
 def test_a_cell_that_only_the_edge_of_a_photo_shows_is_before_its_camera() -> None:
     ring = tuple(camera_on_a_ring(0.6 * k) for k in range(5))
     assert not allowed(ring, 1.35, 0.16, 0.0)  # its middle is outside of the picture, a part of it is not
-    assert allowed(ring, 1.35, 0.0, 0.45)
+    assert allowed(ring, 1.35, 0.0, 0.7)  # in no picture, but not as near
 
 
 def test_one_camera_alone_may_see_anything() -> None:

@@ -18,7 +18,7 @@ def knowable(sampler: OccupancySampler, frames: tuple[Frame, ...]) -> Tensor:
     """(R**3,) bool: cells that may hold something.
 
     A cell near a camera may if enough cameras see it; otherwise it would be painted with whatever these few photos
-    show behind it, a floater before any new camera. Where no camera sees, nothing is decided.
+    show behind it, a floater before any new camera. Farther away, where no camera sees, nothing is decided.
     """
     r = sampler.resolution // _COARSE
     coarse = OccupancySampler(sampler.contraction, torch.zeros(r, r, r, dtype=torch.uint8), sampler.step)
@@ -27,7 +27,7 @@ def knowable(sampler: OccupancySampler, frames: tuple[Frame, ...]) -> Tensor:
     # the contraction makes cells outside of the core as much larger as their distance squared
     width = 4 * sampler.contraction.radius / r * coarse.distance(cells).clamp_min(1.0) ** 2
     unit = _NEAR * sampler.contraction.radius
-    seen, near = torch.zeros(len(x), dtype=torch.int32), torch.zeros(len(x), dtype=torch.int32)
+    seen, near, ahead = (torch.zeros(len(x), dtype=torch.int32) for _ in range(3))
     for f in frames:
         m = f.world_from_cam.float()
         local = (x - m[:3, 3]) @ m[:3, :3]
@@ -39,7 +39,13 @@ def knowable(sampler: OccupancySampler, frames: tuple[Frame, ...]) -> Tensor:
         # a photo that shows any part of a cell can fill it, with its middle outside of the picture
         mu, mv = width / z * c.fx, width / z * c.fy
         part = (u > -mu) & (v > -mv) & (u < c.width + mu) & (v < c.height + mv) & (local[:, 2] > -width)
-        near += part & (local.square().sum(-1) < unit**2)
-    enough = min(max(_LEAST, round(_PART * len(frames))), _ENOUGH, len(frames))
-    allowed = ((near == 0) | (seen >= enough)).reshape(1, 1, r, r, r).float()
+        close = local.square().sum(-1) < unit**2
+        near += part & close
+        ahead += (local[:, 2] > 0) & close
+    few = min(_LEAST, len(frames))
+    enough = max(min(round(_PART * len(frames)), _ENOUGH), few)
+    # among the cameras, but in none of their pictures: there it is the background of a few opposite ones, and a veil
+    # before a new camera that looks a little past its neighbours
+    known = (ahead == 0) | (seen >= few)
+    allowed = (((near == 0) & known) | (seen >= enough)).reshape(1, 1, r, r, r).float()
     return functional.interpolate(allowed, scale_factor=_COARSE, mode="nearest").reshape(-1) > 0
