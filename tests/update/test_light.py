@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from refield.update.light import Relighting, Sightings, fit_light
@@ -66,6 +68,36 @@ def test_what_only_one_photo_says_is_not_believed() -> None:
     assert light is None or float((light.gain(x) - 1).abs().max()) < 0.05
     alone = seen[(seen.fold == 0).nonzero()[:, 0]]
     assert fit_light(alone, BOX, spacing=0.06) is None
+
+
+def test_where_one_photo_alone_looks_its_patches_confirm_each_other() -> None:
+    x = floor_points()
+    distance = (x[:, :2] - torch.tensor([-0.5, 0.0])).norm(dim=-1)
+    factor = torch.where(distance < 0.3, 0.5, 1.0)[:, None]
+    left = (x[:, 0] < 0).long()  # where the first photo alone looks; the others see the rest
+
+    def seen(factor: torch.Tensor | float) -> Sightings:
+        return replace(ground(factor, x, noise=0.03), fold=torch.where(left > 0, 0, 1 + torch.arange(len(x)) % 3))
+
+    unsure = fit_light(seen(factor), BOX, spacing=0.06)
+    assert unsure is None or float((unsure.gain(x[distance < 0.2]) - 1).abs().mean()) < 0.05
+    light = fit_light(seen(factor), BOX, spacing=0.06, patch=0.12)
+    assert light is not None
+    gain = light.gain(x)
+    assert float((gain[distance < 0.2] - 0.5).abs().mean()) < 0.05
+    clear = (distance > 0.45) & (x.abs().amax(-1) < 0.9)
+    assert float((gain[clear] - 1).abs().mean()) < 0.01
+    noise = fit_light(seen(1.0), BOX, spacing=0.06, patch=0.12)
+    assert noise is None or float(noise.log_gain.abs().max()) < 0.02
+
+
+def test_what_one_photo_says_against_others_is_not_believed_in_patches() -> None:
+    x = floor_points()
+    seen = ground(1.0, x, noise=0.02)
+    dark = (seen.fold == 2) & (x[:, :2].norm(dim=-1) < 0.3)
+    one_liar = replace(seen, photo=torch.where(dark[:, None], 0.4 * seen.photo, seen.photo))
+    light = fit_light(one_liar, BOX, spacing=0.06, patch=0.12)
+    assert light is None or float((light.gain(x) - 1).abs().max()) < 0.05
 
 
 def test_applied_multiplies_inside_and_stays_in_range() -> None:

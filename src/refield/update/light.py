@@ -8,7 +8,7 @@ pixels that were left out of a fit confirm it. Letters: P pixels, C lattice node
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -72,6 +72,11 @@ class Sightings:
     def __getitem__(self, chosen: Tensor) -> Sightings:
         return Sightings(self.x[chosen], self.photo[chosen], self.rendered[chosen], self.fold[chosen])
 
+    def in_patches(self, side: float) -> Sightings:
+        """The same with world cubes of this side as groups, each between cubes of the other groups."""
+        patch = (self.x / side).floor().long()
+        return replace(self, fold=(patch * torch.tensor([1, 3, 5])).sum(-1).remainder(_PATCH_FOLDS))
+
 
 @njit(parallel=True, **JIT)
 def _relight(x: _Array, aabb: _Array, log_gain: _Array, rgb: _Array) -> None:
@@ -92,23 +97,24 @@ def _relight(x: _Array, aabb: _Array, log_gain: _Array, rgb: _Array) -> None:
             rgb[s, c] = min(max(rgb[s, c] * math.exp(total), 0), 1)
 
 
+_PATCH_FOLDS = 4
 _COARSER = (4, 2, 1)  # lattice spacings of the pyramid, in the finest
 _HOLD = 2.0  # how many pixels' worth of evidence each level grants to the coarser one
 _MOST = 3.0  # factors are held within [1 / this, this]
 
 
-def fit_light(seen: Sightings, box: Tensor, spacing: float) -> Relighting | None:
+def fit_light(seen: Sightings, box: Tensor, spacing: float, patch: float | None = None) -> Relighting | None:
     """Least-squares factors on a lattice of ``spacing`` (world units) in a world ``box`` (2, 3).
 
     None if no part of it is confirmed: each fold's pixels must be explained better by the factors fitted to the
-    *other* folds than by none.
+    *other* folds than by none. What only one fold has seen no other can confirm; with ``patch``, its cubes of that
+    side confirm each other.
     """
     inside = inside_box(seen.x, box)
     seen = seen[inside.nonzero()[:, 0]]
-    folds = seen.fold.unique()
-    if len(folds) < 2:
-        return None
-    kept = _confirmed(seen, folds, box, spacing)
+    kept = _confirmed(seen, box, spacing)
+    if patch is not None:
+        kept |= _seen_once(seen, box, spacing) & _confirmed(seen.in_patches(patch), box, spacing)
     if not kept.any():
         return None
     gain = _pyramid(seen, box, spacing)
@@ -116,9 +122,21 @@ def fit_light(seen: Sightings, box: Tensor, spacing: float) -> Relighting | None
     return Relighting(box, torch.log(gain) * fade)
 
 
-def _confirmed(seen: Sightings, folds: Tensor, box: Tensor, spacing: float) -> Tensor:
+def _seen_once(seen: Sightings, box: Tensor, spacing: float) -> Tensor:
+    """Nodes (X, Y, Z) bool around which all pixels are of one fold."""
+    shape, ones = _shape(box, spacing), torch.ones(len(seen.x), 1)
+    count = torch.zeros(shape, dtype=torch.long)
+    for fold in seen.fold.unique():
+        own = seen.fold == fold
+        count += _smoothed(_scatter(ones[own], seen.x[own], box, shape))[..., 0] > 0
+    return count == 1
+
+
+def _confirmed(seen: Sightings, box: Tensor, spacing: float) -> Tensor:
     """Nodes (X, Y, Z) bool around which the factors of the other folds lower a fold's error."""
-    shape = _shape(box, spacing)
+    shape, folds = _shape(box, spacing), seen.fold.unique()
+    if len(folds) < 2:
+        return torch.zeros(shape, dtype=torch.bool)
     errors = []
     for fold in folds:
         out = seen.fold == fold

@@ -35,7 +35,8 @@ from refield.update.unseen import sight_of
 from refield.vision.pixels import dilate
 
 DEFAULTS = UpdateConfig()
-_PATCHES, _FOLDS, _SHADING_CELLS = 8, 4, 24  # an object's side in patches that are left out together; in cells
+_PATCHES, _SHADING_CELLS = 8, 24  # an object's side in patches that are left out together; in cells
+_PATCH = 4.0  # cells of the light's lattice that are left out together where one photo alone shows a place
 _LIT_RAYS = 60_000  # of the new photos, for the light on all and on each object; a lattice of factors is no finer
 _NEW_RAYS = 1 << 18  # of the new photos, through the region; about as many as training draws
 _MADE = 20  # of the old photos that an earlier visit put out of date; each takes longer to put right than to learn from
@@ -186,7 +187,8 @@ def _light(known: _Known) -> Relighting | None:
     was = render_many(known.cut, seen.rays)
     x = seen.rays.origins + seen.rays.directions * was.depth[:, None]
     solid = (was.opacity > 0.9).nonzero()[:, 0]
-    return fit_light(Sightings(x, seen.rgb, was.rgb, seen.photo)[solid], box, 1.5 * _pixel(change, box.mean(0)))
+    spacing = 1.5 * _pixel(change, box.mean(0))
+    return fit_light(Sightings(x, seen.rgb, was.rgb, seen.photo)[solid], box, spacing, _PATCH * spacing)
 
 
 def _pixel(change: SceneChange, x: Tensor) -> float:
@@ -208,11 +210,12 @@ def _shading(sparse: Lessons, cut: UpdatedField, change: SceneChange) -> tuple[R
         asked = transform(move.old_from_new, x)
         solid = ((now.opacity > 0.9) & (cut.arrived(x) == i)).nonzero()[:, 0]
         box = outline(move.grid)
-        patch = (asked / (float((box[1] - box[0]).mean()) / _PATCHES)).floor().long()
-        fold = (patch * torch.tensor([1, 3, 5])).sum(-1).remainder(_FOLDS)
+        sightings = Sightings(asked, seen.rgb, now.rgb, seen.photo).in_patches(
+            float((box[1] - box[0]).mean()) / _PATCHES
+        )
         spacing = max(float((box[1] - box[0]).mean()) / _SHADING_CELLS, 2 * _pixel(change, x.mean(0)))
         box = torch.stack([box[0] - 3 * spacing, box[1] + 3 * spacing])  # a fit fades out at the border of its box
-        out.append(fit_light(Sightings(asked, seen.rgb, now.rgb, fold)[solid], box, spacing) if len(solid) else None)
+        out.append(fit_light(sightings[solid], box, spacing) if len(solid) else None)
     return tuple(out)
 
 
