@@ -51,6 +51,20 @@ def test_exif_orientation_is_applied(tmp_path, orientation):
         assert np.array_equal(image.numpy(), turned[orientation])
 
 
+def test_a_png_is_decoded_for_its_size_only_where_more_may_follow_its_pixels(tmp_path, monkeypatch):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    plain, turned = save(tmp_path / "plain.png", RGB), save(tmp_path / "turned.png", RGB, exif=exif).read_bytes()
+    at = turned.index(b"eXIf") - 4
+    size = int.from_bytes(turned[at : at + 4]) + 12
+    rest = turned[at + size :]
+    (tmp_path / "late.png").write_bytes(turned[:at] + rest[:-12] + turned[at : at + size] + rest[-12:])
+    assert images.read_size(tmp_path / "late.png") == (12, 20)
+    assert images.read_image(tmp_path / "late.png").shape == (20, 12, 3)
+    monkeypatch.setattr(Image.Image, "load", lambda self: pytest.fail("decoded"))
+    assert images.read_size(plain) == (20, 12)
+
+
 @pytest.mark.parametrize("mode", ["L", "RGB", "RGBA", "LA", "P", "1"])
 def test_accepted_modes(tmp_path, mode):
     path = save(tmp_path / "a.png", RGB, mode)

@@ -61,7 +61,26 @@ def is_turned(image: Image.Image) -> bool:
 
 
 def _orientation(image: Image.Image) -> int:
-    return int(image.getexif().get(ExifTags.Base.Orientation, 1) or 1)
+    plain = isinstance(image, PngImagePlugin.PngImageFile) and _ends_with_pixels(image)
+    # Pillow decodes all of a PNG to find what may follow the pixels
+    exif = Image.Image.getexif(image) if plain else image.getexif()
+    return int(exif.get(ExifTags.Base.Orientation, 1) or 1)
+
+
+def _ends_with_pixels(image: PngImagePlugin.PngImageFile) -> bool:
+    """Whether nothing that could say how to turn a PNG follows its pixels."""
+    with Path(image.filename).open("rb") as file:
+        file.seek(8)
+        begun = False
+        while len(head := file.read(8)) == 8:
+            length, kind = int.from_bytes(head[:4]), head[4:]
+            if kind == b"IEND":
+                return True
+            if begun and kind != b"IDAT":
+                return False
+            begun |= kind == b"IDAT"
+            file.seek(length + 4, io.SEEK_CUR)
+    return False
 
 
 def read_size(path: Path, *, max_pixels: int = MAX_PIXELS) -> tuple[int, int]:
