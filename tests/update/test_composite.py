@@ -99,6 +99,17 @@ def test_move_in_wins_where_it_overlaps_the_region() -> None:
     assert agreement(rgb(updated), rgb(after)) > 32
 
 
+def test_a_moved_object_takes_along_what_is_right_beneath_it_and_no_ground_beside() -> None:
+    updated = UpdatedField(BallWorld((OLD,)), change_of(moved(OLD, NEW_POSE)), helper=BallWorld(()))
+    beneath = torch.tensor([[0.4, -0.3, -0.005], [0.45, -0.33, -0.01]])
+    assert (updated.arrived(beneath) == 0).all()
+    beside = torch.tensor([[0.55, -0.3, -0.005], [0.4, -0.6, -0.01], [0.4, -0.3, -0.06]])
+    assert (updated.arrived(beside) == -1).all()
+    aloft = at(0.4, -0.3, 0.5)
+    hanging = UpdatedField(BallWorld((OLD,)), change_of(moved(OLD, aloft)), helper=BallWorld(()))
+    assert (hanging.arrived(beneath) == -1).all()
+
+
 def test_gradients_reach_the_positions() -> None:
     """A second estimate refines a pose through an updated field."""
     updated = UpdatedField(BallWorld((OLD,)), change_of(moved(OLD, NEW_POSE)), helper=BallWorld(()))

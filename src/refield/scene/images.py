@@ -6,6 +6,7 @@ Transparent pictures are composited on black, which is what volume rendering sho
 from __future__ import annotations
 
 import io
+import os
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -61,15 +62,15 @@ def is_turned(image: Image.Image) -> bool:
 
 
 def _orientation(image: Image.Image) -> int:
-    plain = isinstance(image, PngImagePlugin.PngImageFile) and _ends_with_pixels(image)
+    plain = isinstance(image, PngImagePlugin.PngImageFile) and _ends_with_pixels(Path(os.fsdecode(image.filename)))
     # Pillow decodes all of a PNG to find what may follow the pixels
     exif = Image.Image.getexif(image) if plain else image.getexif()
     return int(exif.get(ExifTags.Base.Orientation, 1) or 1)
 
 
-def _ends_with_pixels(image: PngImagePlugin.PngImageFile) -> bool:
+def _ends_with_pixels(png: Path) -> bool:
     """Whether nothing that could say how to turn a PNG follows its pixels."""
-    with Path(image.filename).open("rb") as file:
+    with png.open("rb") as file:
         file.seek(8)
         begun = False
         while len(head := file.read(8)) == 8:

@@ -33,8 +33,10 @@ from refield.update.region import Region, carved, grown, move_out
 DILATION = 2.0
 """M_out is the object's grid, its box this many times as large (§10.1.3: 2 to 3)."""
 
-SKIN = 1.0
+SKIN = 1.5
 """How much further than its grid a moved object reaches, in samples of the old field"""
+SKIN_VACATED = 1.0
+"""the same where something left that was solid"""
 
 NOWHERE = Region(())
 
@@ -69,6 +71,7 @@ class Earlier:
 
 NOTHING_EARLIER = Earlier()
 _SOLID = 0.05  # opacity of a sample that was not empty before
+_LAYER = 10  # nodes of a grid that make a layer
 _NODES = 500  # of a grid, that are asked instead of all
 _WHOLE = 0.8  # of them must be the same move's, for an object to be the one that it moved
 _PROBES = 8  # points a cell looked up when the sampler is recomputed: a moved surface crosses cells at any angle
@@ -115,11 +118,15 @@ class UpdatedField:
             region = carved(rest, SKIN * pretrained.sampler.step) if helper is None else move_out(rest, DILATION)
             region = Region(region.grids + earlier.unknown.grids)
         self.region = region
+        self.sampler_step = pretrained.sampler.step
         self.moves: tuple[Move, ...] = moves_of(_part(change, self.skipped))
-        self._shells = tuple(Move(grown(m.grid, SKIN * pretrained.sampler.step), m.new_from_old) for m in self.moves)
+        self._shells, self._inner_shells = (
+            tuple(Move(grown(m.grid, skin * self.sampler_step), m.new_from_old) for m in self.moves)
+            for skin in (SKIN, SKIN_VACATED)
+        )
+        self._ups = tuple(self._up_of(move, shell) for move, shell in zip(self.moves, self._shells))
         self.outlooks = tuple(None if eyes is None else Outlook.from_eyes(eyes, m.grid) for m in self.moves)
         self.sources = tuple(source_of(pretrained, m.grid) for m in self.moves)
-        self.sampler_step = pretrained.sampler.step
         self.boxes = tuple(m.box_now for m in self._shells) + region.boxes + earlier.places.boxes
         self._base: HashField | NerfactoField | None = _base_of(pretrained)
         self._told, self._nothing = self._told_cells(pretrained.sampler)
@@ -288,17 +295,46 @@ class UpdatedField:
         """Which move each world point (S, 3) is answered by, (S,) int64, -1 for none.
 
         A fitted surface is a step or so thick: the moved object takes its skin along, to places that were empty and
-        are nobody else's. What was solid there stays (the ground it stands on now).
+        are nobody else's; less of it to where something left, since ground is being learnt there. What was solid
+        stays (the ground beside it), but for what is right beneath it: a ray that enters the object above its lower
+        edge takes its first sample there.
         """
         owner = owners(x, self.moves)
         skin = torch.where(owner < 0, owners(x, self._shells), -1)
         rows = (skin >= 0).nonzero()[:, 0]
         if len(rows):
             at = x[rows].detach()
-            solid = self.pretrained.density(at) * self.sampler_step > _SOLID
-            free = ~solid | self.region.contains(at) | self.earlier.places.contains(at)
+            free = ~self._was_solid(at) | (self._vacated(at) & (owners(at, self._inner_shells) >= 0))
+            for i, (move, up) in enumerate(zip(self.moves, self._ups)):
+                if up is not None:
+                    free |= (skin[rows] == i) & move.arrived(at + up)
             owner[rows[free]] = skin[rows[free]]
         return torch.where(self.bare.contains(x), -1, owner) if self.bare.grids else owner
+
+    def _was_solid(self, x: Tensor) -> Tensor:
+        """Whether something was at world points (S, 3) before, (S,) bool."""
+        return self.pretrained.density(x) * self.sampler_step > _SOLID
+
+    def _vacated(self, x: Tensor) -> Tensor:
+        """Whether world points (S, 3) are around where something left, now or at an earlier visit, (S,) bool."""
+        return self.region.contains(x) | self.earlier.places.contains(x)
+
+    def _up_of(self, move: Move, shell: Move) -> Tensor | None:
+        """(3,) world: a sample's length away from what a moved object stands on now; None if on nothing.
+
+        What is solid in its skin is a layer of that: the normal is the direction in which it is thinnest.
+        """
+        skin = shell.grid.nodes().reshape(-1, 3)
+        skin = skin[shell.grid.contains(skin) & ~move.grid.contains(skin)]
+        at = transform(move.new_from_old, skin)
+        with torch.no_grad():
+            touched = at[self._was_solid(at) & ~self._vacated(at)].double()
+        if len(touched) < _LAYER:
+            return None
+        normal = torch.linalg.eigh(torch.cov(touched.T)).eigenvectors[:, 0]
+        middle = transform(move.new_from_old, move.grid.occupied().double().mean(0)[None])[0]
+        side = torch.sign(normal @ (middle - touched.mean(0)))
+        return (side * self.sampler_step * normal).float()
 
     def _near(self, x: Tensor) -> Tensor:
         return in_boxes(x, torch.stack(self.boxes)) if self.boxes else torch.zeros_like(x[:, 0], dtype=torch.bool)
