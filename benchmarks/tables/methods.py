@@ -36,6 +36,7 @@ VIEWS = (1, 2, 3, 4, 8, 12, 16)
 """numbers of new photos (§12.2)"""
 WHOLE, TRAINING = 20, 60
 """the longer re-training goes on for so many times our whole update, or our training alone, whichever is longer"""
+_SPARE = 1.1  # steps of a longer training may be quicker than those that foretell its time
 ALIGNMENTS = {"as rendered": EvaluateConfig(), "aligned": EvaluateConfig(align=True)}
 UNREFINED = EstimateConfig(refine=RefineConfig(steps=(0, 0)))
 """the initial poses (§12.1)"""
@@ -245,7 +246,8 @@ def retrained_long(lab: Lab, case: Case) -> Record:
     """Re-training for `WHOLE` times our update, with a schedule to match: can more time make up for it?"""
     first, ours, usual = (run_method(lab, case, m) for m in ("estimate", "ours", "retrained"))
     seconds = max(WHOLE * (first["total"] + ours["train"]), TRAINING * ours["seconds"]["train"])
-    config = replace(lab.fit, steps=max(math.ceil(seconds * usual["steps"] / usual["train"]), 1), patience=10**6)
+    steps = math.ceil(_SPARE * seconds * usual["steps"] / usual["train"])
+    config = replace(lab.fit, steps=max(steps, 1), patience=10**6)
     return _trained(
         lab, case, "retrained_long", lambda change, curve: retrain(case.capture, change, config, curve), config.steps
     )

@@ -186,5 +186,5 @@ def _shown_in(sight: Sight, new_from_old: Tensor) -> dict[int, Tensor]:
 
 
 def _full_size(mask: Mask, c: Changed) -> Tensor:
-    size = np.array([c.view.frame.camera.height, c.view.frame.camera.width])
-    return torch.from_numpy(ndimage.zoom(mask.astype(np.uint8), size / c.view.shape, order=0) > 0)
+    camera = c.view.frame.camera
+    return torch.from_numpy(pixels.enlarged(mask, (camera.height, camera.width)))

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -133,8 +132,7 @@ def projection_check(nodes: Tensor, seen: Sequence[OldMask], agree: float) -> ND
 
 def full_size(mask: Mask, frame: Frame) -> Tensor:
     """A mask (h, w) at the size of its photo, (H, W) bool."""
-    size = (frame.camera.width, frame.camera.height)
-    return torch.from_numpy(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
+    return torch.from_numpy(pixels.enlarged(mask, (frame.camera.height, frame.camera.width)))
 
 
 def _projected(points: Tensor, camera: Camera, world_from_cam: Tensor) -> tuple[Tensor, Tensor]:
