@@ -36,7 +36,7 @@ VIEWS = (1, 2, 3, 4, 8, 12, 16)
 """numbers of new photos (§12.2)"""
 WHOLE, TRAINING = 20, 60
 """the longer re-training goes on for so many times our whole update, or our training alone, whichever is longer"""
-_SPARE = 1.5  # late steps are quicker than those of a short training, which foretell the time
+_SPARE = 1.7  # late steps are quicker than those of a short training, which foretell the time
 ALIGNMENTS = {"as rendered": EvaluateConfig(), "aligned": EvaluateConfig(align=True)}
 UNREFINED = EstimateConfig(refine=RefineConfig(steps=(0, 0)))
 """the initial poses (§12.1)"""
