@@ -17,7 +17,7 @@ from refield.estimate.detect import Changed, Mask
 from refield.estimate.hull import Hull
 from refield.estimate.lattice import Lattice, Voxels
 from refield.estimate.layers import Sight, layers_at
-from refield.estimate.look import Array
+from refield.estimate.look import Array, full_size
 from refield.estimate.objects import Old
 from refield.estimate.pose_change import PoseChange
 from refield.field.radiance import Field
@@ -65,7 +65,7 @@ def concluded(scene: Told, settled: Settled) -> SceneChange:
     if not reasons:
         reasons = ["some pixels differ, but no object that moved, left or arrived explains them better than before"]
     ins, outs = _pixel_masks(scene.field, scene.changed, settled, lattice) if changes else ((), ())
-    unexplained = tuple(_full_size(m, c) for m, c in zip(left, scene.changed))
+    unexplained = tuple(full_size(m, c.view.frame) for m, c in zip(left, scene.changed))
     return SceneChange(tuple(changes), scene.photos, "; ".join(reasons), ins, outs, unexplained)
 
 
@@ -76,7 +76,7 @@ def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...]) -> 
         return SceneChange((), photos, why)
     share = 100 * float(np.mean([c.mask.mean() for c in changed]))
     why += f"; {share:.0f} % of the photos' pixels are not understood: do the photos show one and the same state?"
-    return SceneChange((), photos, why, unexplained=tuple(_full_size(c.mask, c) for c in changed))
+    return SceneChange((), photos, why, unexplained=tuple(full_size(c.mask, c.view.frame) for c in changed))
 
 
 def _moved(frames: Sequence[Frame], old: Old, change: PoseChange) -> ObjectChange:
@@ -161,8 +161,8 @@ def _pixel_masks(
         gone = np.zeros(c.view.shape, bool)
         for k in (*settled.moved, *settled.removed):
             gone |= past.silhouette(c.view, settled.olds[k])
-        ins.append(_full_size(c.mask & came, c))
-        outs.append(_full_size(pixels.dilate(gone, 1), c))
+        ins.append(full_size(c.mask & came, c.view.frame))
+        outs.append(full_size(pixels.dilate(gone, 1), c.view.frame))
     olds = [settled.olds[k] for k in (*settled.moved, *settled.removed)]
     for k, change in settled.moved.items():
         shown = _shown_in(Sight(field, settled.olds[k], settled.views, olds), change.new_from_old)
@@ -183,8 +183,3 @@ def _shown_in(sight: Sight, new_from_old: Tensor) -> dict[int, Tensor]:
             full = cv2.resize(full, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
         out[crop.photo_index] = torch.from_numpy(full > 0.5)
     return out
-
-
-def _full_size(mask: Mask, c: Changed) -> Tensor:
-    camera = c.view.frame.camera
-    return torch.from_numpy(pixels.enlarged(mask, (camera.height, camera.width)))

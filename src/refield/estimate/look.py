@@ -25,6 +25,7 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
 from refield.scene.images import scaled_image
+from refield.vision import pixels
 
 Array = NDArray[Any]
 Directed = Callable[[Tensor, Tensor], Tensor]
@@ -259,6 +260,11 @@ def view_of(radiance: Field, frame: Frame, max_pixels: int) -> View:
         seen.depth.reshape(shape).numpy(),
         seen.opacity.reshape(shape).numpy(),
     )
+
+
+def full_size(mask: Array, frame: Frame) -> Tensor:
+    """A mask (h, w) at the size of its photo, (H, W) bool."""
+    return torch.from_numpy(pixels.enlarged(mask, (frame.camera.height, frame.camera.width)))
 
 
 def spread_out(frames: Sequence[Frame], count: int) -> list[Frame]:

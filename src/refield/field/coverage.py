@@ -44,8 +44,8 @@ def knowable(sampler: OccupancySampler, frames: tuple[Frame, ...]) -> Tensor:
         ahead += (local[:, 2] > 0) & close
     few = min(_LEAST, len(frames))
     enough = max(min(round(_PART * len(frames)), _ENOUGH), few)
-    # among the cameras, but in none of their pictures: there it is the background of a few opposite ones, and a veil
+    # ahead of cameras, but in none of their pictures: there it is the background of a few opposite ones, and a veil
     # before a new camera that looks a little past its neighbours
-    known = (ahead == 0) | (seen >= few)
-    allowed = (((near == 0) & known) | (seen >= enough)).reshape(1, 1, r, r, r).float()
+    needed = torch.where(near > 0, enough, torch.where(ahead > 0, few, 0))
+    allowed = (seen >= needed).reshape(1, 1, r, r, r).float()
     return functional.interpolate(allowed, scale_factor=_COARSE, mode="nearest").reshape(-1) > 0

@@ -210,10 +210,9 @@ def _shading(sparse: Lessons, cut: UpdatedField, change: SceneChange) -> tuple[R
         asked = transform(move.old_from_new, x)
         solid = ((now.opacity > 0.9) & (cut.arrived(x) == i)).nonzero()[:, 0]
         box = outline(move.grid)
-        sightings = Sightings(asked, seen.rgb, now.rgb, seen.photo).in_patches(
-            float((box[1] - box[0]).mean()) / _PATCHES
-        )
-        spacing = max(float((box[1] - box[0]).mean()) / _SHADING_CELLS, 2 * _pixel(change, x.mean(0)))
+        side = float((box[1] - box[0]).mean())
+        sightings = Sightings(asked, seen.rgb, now.rgb, seen.photo).in_patches(side / _PATCHES)
+        spacing = max(side / _SHADING_CELLS, 2 * _pixel(change, x.mean(0)))
         box = torch.stack([box[0] - 3 * spacing, box[1] + 3 * spacing])  # a fit fades out at the border of its box
         out.append(fit_light(sightings[solid], box, spacing) if len(solid) else None)
     return tuple(out)

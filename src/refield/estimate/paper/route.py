@@ -8,12 +8,11 @@ import torch
 from torch import Tensor
 
 from refield.estimate import look
-from refield.estimate.look import View
+from refield.estimate.look import View, full_size
 from refield.estimate.models import Models
 from refield.estimate.paper.associate import Thing, associate
 from refield.estimate.paper.config import PaperConfig
 from refield.estimate.paper.detect import ViewMasks, detect
-from refield.estimate.paper.segment import full_size
 from refield.estimate.paper.settle import Outcome, Scene, outcome, settle
 from refield.field.radiance import Field
 from refield.scene.capture import Capture, Frame

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.estimate.detect import Mask
-from refield.estimate.look import Array, View
+from refield.estimate.look import Array, View, full_size
 from refield.estimate.paper.detect import Box, enlarged
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame
@@ -128,11 +128,6 @@ def projection_check(nodes: Tensor, seen: Sequence[OldMask], agree: float) -> ND
         misses[rows] += ~mask[at[:, 1], at[:, 0]]
         left = left[misses[left] <= allowed]
     return (looks > 0) & (misses <= (1 - agree) * looks + 1e-9)
-
-
-def full_size(mask: Mask, frame: Frame) -> Tensor:
-    """A mask (h, w) at the size of its photo, (H, W) bool."""
-    return torch.from_numpy(pixels.enlarged(mask, (frame.camera.height, frame.camera.width)))
 
 
 def _projected(points: Tensor, camera: Camera, world_from_cam: Tensor) -> tuple[Tensor, Tensor]:
