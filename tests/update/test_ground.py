@@ -97,6 +97,18 @@ def test_what_was_looked_through_is_empty_and_what_was_seen_beneath_the_floor_ma
     assert found[free] == 1 and found[hidden] == 0.5 and found[leg] == 0
 
 
+def test_the_skin_that_the_old_field_shows_around_what_left_is_as_empty_as_its_rim():
+    cells = move_out(SceneChange((box_at(0.0),)), 1.5).sampler(0.02)
+    planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]
+    x = torch.tensor([[0.22, 0.0, 0.2], [0.28, 0.0, 0.2], [0.0, 0.22, -0.04]])  # its side is at 0.19
+    coarse = replace(cells, grid=torch.ones(32, 32, 32, dtype=torch.uint8))
+    assert 0.03 < coarse.width(torch.tensor(0.5)) < 0.05
+    seen = Sight(coarse, torch.tensor([], dtype=torch.long), torch.tensor([]))
+    for ground, tolls in ((footholds([box_at(0.0).grid], planes), [0.5, 0.0, 0.0]), ((), [0.0, 0.0, 0.0])):
+        found = emptiness(SceneChange((box_at(0.0),)), cells, Region(()), ground, seen)
+        assert found[cells.cells(x)].tolist() == tolls
+
+
 def test_a_place_that_is_no_object_s_own_is_as_empty():
     """What two places of an object shared, and only its second visit uncovers."""
     planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]

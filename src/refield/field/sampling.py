@@ -76,6 +76,10 @@ class OccupancySampler:
         m = self._contracted(cells, None).abs().amax(-1)
         return torch.where(m > 1, 1 / (2 - m).clamp_min(1e-3), m)
 
+    def width(self, reach: Tensor) -> Tensor:
+        """Side of a cell, world units, ``reach`` core radii (any shape) from the core's centre."""
+        return 4 * self.contraction.radius / self.resolution * reach.clamp_min(1.0) ** 2
+
     def points_in(self, cells: Tensor, jitter: bool = True) -> Tensor:
         """A world point in each cell: random, or its centre. (K,) -> (K, 3)."""
         offset = torch.rand(len(cells), 3, device=cells.device) if jitter else None

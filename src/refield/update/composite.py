@@ -435,8 +435,7 @@ def _base_of(field: Field) -> HashField | NerfactoField | None:
 def _by_cells(sampler: OccupancySampler, box: Tensor) -> Tensor:
     """A world box (2, 3) grown by two and a half of the sampler's cells."""
     space = sampler.contraction
-    reach = float(((box - space.centre) / space.radius).abs().max())
-    margin = 2.5 * 4 * space.radius / sampler.resolution * max(reach, 1.0) ** 2
+    margin = 2.5 * float(sampler.width(((box - space.centre) / space.radius).abs().max()))
     return torch.stack([box[0] - margin, box[1] + margin])
 
 

@@ -14,14 +14,15 @@ from refield.field.occupancy import OccupancyTrainer
 from refield.field.radiance import Field, HashField, HashFieldConfig
 from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Frame
-from refield.scene.change import SceneChange
+from refield.scene.change import OccupancyGrid, SceneChange
 from refield.update.ground import Foothold, rim
-from refield.update.region import Region
+from refield.update.region import Region, grown
 from refield.update.unseen import Sight
 
 _OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
 _WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
 _RIM = 0.5  # as empty as this is the rim of what stood on a plane, and everything beneath the plane
+_SKIN = 1.5  # cells of the old field; so far around an object that left its fitted surface may be taken for something
 _BAND = 2.5  # cells above and beneath what an object stood on over which it becomes so empty
 
 
@@ -64,8 +65,9 @@ def emptiness(
     What stood in the way of everything is not there any more: deep inside an object that left is nothing, and only
     near its surface may something else begin: the ground under it, the wall behind it. Where that is one of
     ``ground``, it is there, and the more so the nearer to it; what is above it near the object's surface is half as
-    empty, since a wall that the object leant on may not be among them. Where old photos looked through (``sight``),
-    nothing is. 0 in ``taken``, where something stands now.
+    empty, since a wall that the object leant on may not be among them; so is what lies above it right beside the
+    object, where the old field shows the object's own skin. Where old photos looked through (``sight``), nothing is.
+    0 in ``taken``, where something stands now.
     """
     r = cells.resolution
     depth = torch.zeros(r**3)
@@ -82,7 +84,8 @@ def emptiness(
         depth = torch.maximum(depth, (distance / reach - 1).clamp(0, 1))
         above = [f.plane.height(centres.numpy()) > _band(f, cell) for f in ground if f.grid is grid]
         if above:
-            free = inside.reshape(-1) & torch.from_numpy(np.logical_and.reduce(above))
+            beside = inside.reshape(-1) if sight is None else grown(grid, _skin(grid, sight.sampler)).contains(centres)
+            free = beside & torch.from_numpy(np.logical_and.reduce(above))
             depth[free] = depth[free].clamp_min(_RIM)
     dark = None if sight is None else sight.dark.occupied(centres)
     for foothold in ground:
@@ -95,6 +98,11 @@ def emptiness(
     if sight is not None:
         depth[~sight.possible.occupied(centres)] = 1.0
     return torch.where(taken.contains(centres), 0.0, depth) if taken.grids else depth
+
+
+def _skin(grid: OccupancyGrid, sampler: OccupancySampler) -> float:
+    space = sampler.contraction
+    return _SKIN * float(sampler.width(((grid.tight_aabb().mean(0) - space.centre) / space.radius).abs().max()))
 
 
 def _band(foothold: Foothold, cell: float) -> float:

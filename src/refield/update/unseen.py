@@ -59,7 +59,7 @@ def sight_of(field: Field, frames: Sequence[Frame], boxes: Sequence[Tensor]) -> 
     s = field.sampler
     cells = torch.cat([s.cells_in(b) for b in boxes]).unique()
     x = s.points_in(cells, jitter=False)
-    side = 4 * s.contraction.radius / s.resolution * s.distance(cells).clamp_min(1) ** 2  # what is far is contracted
+    side = s.width(s.distance(cells))
     before = torch.full((len(cells),), -torch.inf)
     for frame in frames[:: -(-len(frames) // _EYES) or 1]:
         camera = frame.camera.shrunk(min(_SIDE / max(frame.camera.width, frame.camera.height), 1.0))
