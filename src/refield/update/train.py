@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,7 +31,6 @@ from refield.update.recall import earlier_of
 from refield.update.region import Region, meets, move_out
 from refield.update.supervision import Lessons, changed_pixels, new_lessons, old_ring, places_of
 from refield.update.unseen import sight_of
-from refield.vision.pixels import dilate
 
 DEFAULTS = UpdateConfig()
 _PATCHES, _SHADING_CELLS = 8, 24  # an object's side in patches that are left out together; in cells
@@ -181,7 +179,7 @@ def _light(known: _Known) -> Relighting | None:
     side = max(float((o.grid.tight_aabb().diff(dim=0)).max()) for o in change.objects)
     box = torch.stack([box[0] - 1.5 * side, box[1] + 1.5 * side])
     unknown = [c & ~r for c, r in zip(known.changed, known.recalled)]
-    still = ~sparse.within([dilate(c, math.ceil(0.01 * c.shape[1])) for c in unknown])
+    still = ~sparse.within(unknown)  # up to the objects' very edges, where their shadows are darkest
     may = (still & crosses(sparse.rays, [box])).nonzero()[:, 0]
     seen = sparse[_some(may, _LIT_RAYS)]
     was = render_many(known.cut, seen.rays)
