@@ -24,8 +24,7 @@ def knowable(sampler: OccupancySampler, frames: tuple[Frame, ...]) -> Tensor:
     coarse = OccupancySampler(sampler.contraction, torch.zeros(r, r, r, dtype=torch.uint8), sampler.step)
     cells = torch.arange(r**3)
     x = coarse.points_in(cells, jitter=False)
-    # the contraction makes cells outside of the core as much larger as their distance squared
-    width = 4 * sampler.contraction.radius / r * coarse.distance(cells).clamp_min(1.0) ** 2
+    width = coarse.width(coarse.distance(cells))
     unit = _NEAR * sampler.contraction.radius
     seen, near, ahead = (torch.zeros(len(x), dtype=torch.int32) for _ in range(3))
     for f in frames:

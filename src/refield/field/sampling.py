@@ -78,6 +78,7 @@ class OccupancySampler:
 
     def width(self, reach: Tensor) -> Tensor:
         """Side of a cell, world units, ``reach`` core radii (any shape) from the core's centre."""
+        # the contraction makes cells outside of the core as much larger as their distance squared
         return 4 * self.contraction.radius / self.resolution * reach.clamp_min(1.0) ** 2
 
     def points_in(self, cells: Tensor, jitter: bool = True) -> Tensor:
