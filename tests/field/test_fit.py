@@ -102,7 +102,8 @@ def test_a_fit_that_leads_nowhere_begins_anew(capture: Capture, monkeypatch: pyt
 
 def test_what_leads_nowhere(capture: Capture) -> None:
     fit = object.__new__(_Fit)
-    for first, second, stuck in ((0.0135, 0.0115, True), (0.0135, 0.006, False), (0.004, 0.004, False)):
+    sound = ((0.0135, 0.006, False), (0.004, 0.004, False))
+    for first, second, stuck in ((0.0135, 0.0115, True), (0.0118, 0.0099, True), *sound):
         fit.steps_done, fit.loss = 250, first
         assert not fit._stuck()
         fit.steps_done, fit.loss = 500, second
