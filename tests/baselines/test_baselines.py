@@ -130,6 +130,18 @@ def test_a_curve_is_scored_while_the_clock_stands(capture: Capture, change: Scen
     assert curve.points[-1].scores["psnr"] == float(field.density_in.abs().sum())
 
 
+def test_a_fit_that_begins_anew_leaves_no_looks_behind(capture: Capture, change: SceneChange) -> None:
+    curve = Curve(lambda f: {"d": float(f.density(torch.zeros(1, 3)))}, [2, 4, 6])
+    field = retrain(capture, change, replace(TINY, steps=2))
+    for step in (1, 2, 3, 4, 5, 1):  # the second attempt begins
+        curve(step, field)
+    assert curve.points == []
+    for step in (2, 3, 4):
+        curve(step, field)
+    curve.look(4, field)
+    assert [p.step for p in curve.points] == [2, 4, 4]
+
+
 def test_the_same_with_and_without_a_curve(capture: Capture, change: SceneChange) -> None:
     short = replace(TINY, steps=20)
     a = retrain(capture, change, short)

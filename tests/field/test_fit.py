@@ -97,12 +97,20 @@ def test_a_fit_that_leads_nowhere_begins_anew(capture: Capture, monkeypatch: pyt
     assert asked == [1, 2, 3, 4, 5, *range(1, 21)]
     assert all(torch.equal(a, b) for a, b in zip(again.parameters(), other.parameters()))
     monkeypatch.setattr(_Fit, "_stuck", lambda fit: True)
-    fit_field(capture, short)  # the last attempt is kept, whatever it is
+    last = fit_field(capture, short)  # the last attempt is kept, whatever it is
+    monkeypatch.setattr(_Fit, "_stuck", lambda fit: False)
+    fifth = fit_field(capture, replace(short, seed=short.seed + 4))
+    assert all(torch.equal(a, b) for a, b in zip(last.parameters(), fifth.parameters()))
+    asked.clear()
+    monkeypatch.setattr(_Fit, "_stuck", lambda fit: asked.append(fit.steps_done) is None)
+    monkeypatch.setattr("refield.field.fit._LATE", 0.0)
+    fit_field(capture, short)
+    assert asked == [*range(1, 21)]  # too late to begin anew: it goes on with what it has
 
 
 def test_what_leads_nowhere(capture: Capture) -> None:
     fit = object.__new__(_Fit)
-    sound = ((0.0135, 0.006, False), (0.004, 0.004, False))
+    sound = ((0.0135, 0.006, False), (0.0058, 0.0056, False), (0.004, 0.004, False))
     for first, second, stuck in ((0.0135, 0.0115, True), (0.0118, 0.0099, True), *sound):
         fit.steps_done, fit.loss = 250, first
         assert not fit._stuck()

@@ -109,6 +109,16 @@ def test_the_skin_that_the_old_field_shows_around_what_left_is_as_empty_as_its_r
         assert found[cells.cells(x)].tolist() == tolls
 
 
+def test_around_what_is_small_beside_the_old_field_s_cells_only_as_much_as_its_rim_is_as_empty():
+    cells = move_out(SceneChange((box_at(0.0),)), 1.5).sampler(0.02)
+    planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]
+    huge = replace(cells, grid=torch.ones(4, 4, 4, dtype=torch.uint8))
+    seen = Sight(huge, torch.tensor([], dtype=torch.long), torch.tensor([]))
+    x = torch.tensor([[0.21, 0.0, 0.2], [0.26, 0.0, 0.2]])  # its side is at 0.19, its rim 0.05 deep
+    found = emptiness(SceneChange((box_at(0.0),)), cells, Region(()), footholds([box_at(0.0).grid], planes), seen)
+    assert found[cells.cells(x)].tolist() == [0.5, 0.0]
+
+
 def test_a_place_that_is_no_object_s_own_is_as_empty():
     """What two places of an object shared, and only its second visit uncovers."""
     planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]

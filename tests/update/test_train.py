@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,8 +16,12 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.images import write_image
+from refield.update import train
 from refield.update.config import UpdateConfig
+from refield.update.light import Sightings
+from refield.update.supervision import changed_pixels, places_of
 from refield.update.train import UpdateProgress, update_field
+from refield.vision.pixels import dilate
 from tests.update.worlds import Ball, BallWorld, at, looking_from, moved
 
 SIZE = 48
@@ -91,6 +96,24 @@ def test_the_hidden_floor_is_learnt_and_the_rest_kept(case: tuple[Capture, Scene
     assert stages[0] == "move" and "train" in stages
     assert looks and all(look.psnr > 10 for look in looks)
     assert updated.why_stopped
+
+
+def test_light_is_learnt_up_to_the_objects_edges(
+    case: tuple[Capture, SceneChange], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture, change = case
+    asked: list[Sightings] = []
+    monkeypatch.setattr(train, "fit_light", lambda seen, *more: asked.append(seen))
+    update_field(capture, OLD_FIELD, change, replace(QUICK, steps=1))
+    frame, seen = change.frames[0], asked[0]
+    changed = changed_pixels(change, places_of(change), 0, frame)
+    m = frame.world_from_cam.float()
+    uv, _ = frame.camera.project((seen.x[seen.fold == 0] - m[:3, 3]) @ m[:3, :3])
+    told = np.zeros_like(changed)
+    told[uv[:, 1].long(), uv[:, 0].long()] = True
+    assert not (told & changed).any()
+    ring = dilate(changed, 1) & ~changed
+    assert (told & ring).sum() > 0.5 * ring.sum()
 
 
 def test_without_new_photos_things_are_only_moved(case: tuple[Capture, SceneChange]) -> None:

@@ -28,7 +28,8 @@ class Point:
 class Curve:
     """Scores a running fit at chosen steps: hand it to ``fit_field`` as ``on_step``, from its making on the clock runs.
 
-    The field is scored as a new one would be: only where it looks, not in training.
+    The field is scored as a new one would be: only where it looks, not in training. Of a fit that began anew the last
+    attempt's looks are kept; its seconds hold those of the attempts before.
     """
 
     def __init__(self, score: Score, steps: Sequence[int]) -> None:
@@ -42,6 +43,8 @@ class Curve:
         return time.perf_counter() - self._began - self._looking
 
     def __call__(self, step: int, field: HashField) -> None:
+        if self.points and step < self.points[-1].step:  # the fit has begun anew; what it had is no part of it
+            self.points.clear()
         if step in self._steps:
             training = field.training
             self.look(step, field.eval())

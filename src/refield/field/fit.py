@@ -86,9 +86,10 @@ class _StuckError(RuntimeError):
 
 
 # Some fits of a scene with a repeating texture, seen from all around, end in foam before the cameras that explains its
-# photos at 17 to 20 dB and hardly better: a few in a hundred, of some captures half. Another seed does not. A sound fit
+# photos at 17 to 20 dB and hardly better: a few in a hundred, of some captures most. Another seed does not. A sound fit
 # gains 2 dB from the first of these steps to the second.
 _TRIES, _FIRST_STEP, _SECOND_STEP = 5, 250, 500
+_LATE = 0.3  # of its time; so late a fit does not begin anew
 _BAD, _LEAST_DROP = 0.007, 0.8  # mean squared error of the colours; its ratio between the two
 
 ProgressCallback = Callable[[FitProgress], None]
@@ -299,7 +300,7 @@ class _Fit:
             self.steps_done = step + 1
             if self.on_step:
                 self.on_step(step + 1, self.model)
-            if may_give_up and self._stuck():
+            if may_give_up and self._stuck() and progress_of(self.config, 0, self.began) < _LATE:
                 raise _StuckError
             if (step + 1) % self.config.check_every == 0:
                 looks.append(self._look(step + 1))

@@ -33,7 +33,8 @@ class UpdateConfig:
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii of the old field from the camera (§10.1)"""
     emptiness: float = 5e-2
-    """weight of the colour that comes from where nothing can be: deep inside what left, where nothing was before"""
+    """weight of the colour that comes from where nothing can be: deep inside what left, where nothing was before and,
+    half as much, beneath the ground that it stood on and above that in its rim and right beside it"""
     held_out: int = 20
     """every so-many-th pixel that could teach is kept to judge by"""
     check_every: int = 25

@@ -22,7 +22,7 @@ from refield.update.unseen import Sight
 _OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
 _WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
 _RIM = 0.5  # as empty as this is the rim of what stood on a plane, and everything beneath the plane
-_SKIN = 1.5  # cells of the old field; so far around an object that left its fitted surface may be taken for something
+_BESIDE = 1.5  # cells of the old field; so far around an object that left its fitted surface may be taken for something
 _BAND = 2.5  # cells above and beneath what an object stood on over which it becomes so empty
 
 
@@ -76,16 +76,17 @@ def emptiness(
     left = [o.grid for o in change.objects if o.kind != "added"]
     left += [f.grid for f in ground if all(f.grid is not g for g in left)]
     for grid in left:
-        inside = grid.contains(centres).reshape(r, r, r)
-        if not inside.any():
+        if not len(grid.occupied()):
             continue
-        reach = rim(grid)
-        distance = torch.from_numpy(distance_transform_edt(inside.numpy())).float().reshape(-1) * cell
-        depth = torch.maximum(depth, (distance / reach - 1).clamp(0, 1))
+        inside = grid.contains(centres)
+        if inside.any():  # not of what is thinner than a cell
+            distance = distance_transform_edt(inside.reshape(r, r, r).numpy())
+            deep = torch.from_numpy(distance).float().reshape(-1) * cell / rim(grid) - 1
+            depth = torch.maximum(depth, deep.clamp(0, 1))
         above = [f.plane.height(centres.numpy()) > _band(f, cell) for f in ground if f.grid is grid]
         if above:
-            beside = inside.reshape(-1) if sight is None else grown(grid, _skin(grid, sight.sampler)).contains(centres)
-            free = beside & torch.from_numpy(np.logical_and.reduce(above))
+            near = inside if sight is None else grown(grid, _skin(grid, sight.sampler)).contains(centres)
+            free = near & torch.from_numpy(np.logical_and.reduce(above))
             depth[free] = depth[free].clamp_min(_RIM)
     dark = None if sight is None else sight.dark.occupied(centres)
     for foothold in ground:
@@ -101,8 +102,11 @@ def emptiness(
 
 
 def _skin(grid: OccupancyGrid, sampler: OccupancySampler) -> float:
+    """How far around an object the old field may show the object's own skin, world units; no further than its rim is
+    deep, since around what is small or far away a cell holds much else."""
     space = sampler.contraction
-    return _SKIN * float(sampler.width(((grid.tight_aabb().mean(0) - space.centre) / space.radius).abs().max()))
+    reach = ((grid.tight_aabb().mean(0) - space.centre) / space.radius).abs().max()
+    return min(_BESIDE * float(sampler.width(reach)), rim(grid))
 
 
 def _band(foothold: Foothold, cell: float) -> float:

@@ -140,6 +140,8 @@ def changed_pixels(change: SceneChange, places: Places, index: int, frame: Frame
     total = np.zeros((frame.camera.height, frame.camera.width), bool)
     for place in places.was + places.now:
         total |= place.silhouette(frame)
+    shrunk = frame.camera.width / frame.camera.within(_PIXELS).width
+    total = dilate(total, math.ceil(shrunk) - 1)  # the edge of what was drawn smaller is not exact
     for masks in (change.masks_in, change.masks_out):
         if index < len(masks):
             total |= masks[index].numpy()
