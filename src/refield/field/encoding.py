@@ -33,6 +33,10 @@ class Contraction:
         """Contracted (..., 3) -> world (..., 3)."""
         return reference.uncontract(y, self.centre, self.radius)
 
+    def reach(self, x: Tensor) -> Tensor:
+        """L-infinity distance of world points (..., 3) from the centre, in core radii, (...,)."""
+        return ((x - self.centre) / self.radius).abs().amax(-1)
+
 
 class HashGrid(nn.Module):
     """Multi-resolution hash encoding of the contracted cube (Instant-NGP), two features a level."""

@@ -434,8 +434,7 @@ def _base_of(field: Field) -> HashField | NerfactoField | None:
 
 def _by_cells(sampler: OccupancySampler, box: Tensor) -> Tensor:
     """A world box (2, 3) grown by two and a half of the sampler's cells."""
-    space = sampler.contraction
-    margin = 2.5 * float(sampler.width(((box - space.centre) / space.radius).abs().max()))
+    margin = 2.5 * float(sampler.width(sampler.contraction.reach(box)).max())
     return torch.stack([box[0] - margin, box[1] + margin])
 
 

@@ -49,8 +49,7 @@ def without_directions(helper: HashField, into: list[Tensor]) -> None:
 def step_near(field: Field, point: Tensor) -> float:
     """Length of the old field's samples at a world point (3,), world units."""
     s = field.sampler
-    reach = float(((point - s.contraction.centre) / s.contraction.radius).abs().max())
-    return s.step * max(reach, 1.0) ** 1.5
+    return s.step * max(float(s.contraction.reach(point)), 1.0) ** 1.5
 
 
 def emptiness(
@@ -104,9 +103,8 @@ def emptiness(
 def _skin(grid: OccupancyGrid, sampler: OccupancySampler) -> float:
     """How far around an object the old field may show the object's own skin, world units; no further than its rim is
     deep, since around what is small or far away a cell holds much else."""
-    space = sampler.contraction
-    reach = ((grid.tight_aabb().mean(0) - space.centre) / space.radius).abs().max()
-    return min(_BESIDE * float(sampler.width(reach)), rim(grid))
+    width = sampler.width(sampler.contraction.reach(grid.tight_aabb().mean(0)))
+    return min(_BESIDE * float(width), rim(grid))
 
 
 def _band(foothold: Foothold, cell: float) -> float:
