@@ -28,7 +28,7 @@ from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.inside import in_boxes
 from refield.scene.pose import rotate, transform
 from refield.update.light import Relighting
-from refield.update.region import Region, carved, grown, move_out
+from refield.update.region import FINER, Region, carved, grown, move_out
 
 DILATION = 2.0
 """M_out is the object's grid, its box this many times as large (§10.1.3: 2 to 3)."""
@@ -190,10 +190,12 @@ class UpdatedField:
 
     @property
     def _split(self) -> tuple[OccupancySampler, OccupancySampler]:
-        """The sampler of what never changed and that of the rest; kept, since marching remembers a grid."""
+        """The sampler of what never changed and that of the rest, which is finer; kept, since marching remembers a
+        grid."""
         if self._split_of is None or self._split_of[0] is not self.sampler.grid:
             grid, told = self.sampler.grid, self._retold
-            parts = replace(self.sampler, grid=grid * (1 - told)), replace(self.sampler, grid=grid * told)
+            finer = FINER * self.sampler.step
+            parts = replace(self.sampler, grid=grid * (1 - told)), replace(self.sampler, grid=grid * told, step=finer)
             self._split_of = grid, parts
         return self._split_of[1]
 

@@ -14,6 +14,9 @@ from refield.field.warp import crossing, outline
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
 
+FINER = 0.5
+"""Length of the samples of what changed, in samples of the old field: about a pixel of its photos in place of two. A
+surface is as thick as a sample is long, and in a thick one each of a few photos may have a layer of its own."""
 _CHUNK = 65536  # rays
 
 
@@ -47,12 +50,13 @@ class Region:
     def sampler(self, step: float) -> OccupancySampler:
         """Looks everywhere in the region and nowhere else; its core cube is the region's bounding cube.
 
-        Its cells are as wide as a sample is long, within what memory affords.
+        Its cells are as wide as ``step``, the length of the old field's samples, within what memory affords; its own
+        samples are shorter.
         """
         box = self.box
         space = Contraction(box.mean(0), float((box[1] - box[0]).max()) / 2 * 1.02)
         resolution = int(min(max(4 * space.radius / step, 64), 160))
-        empty = OccupancySampler(space, torch.zeros(resolution, resolution, resolution, dtype=torch.uint8), step)
+        empty = OccupancySampler(space, torch.zeros(resolution, resolution, resolution, dtype=torch.uint8), FINER * step)
         cells = empty.cells_in(box)
         grid = empty.grid.clone()
         grid.view(-1)[cells] = self.contains(empty.points_in(cells, jitter=False)).to(torch.uint8)
@@ -60,12 +64,13 @@ class Region:
 
 
 def meets(sampler: OccupancySampler, rays: Rays) -> Tensor:
-    """Whether each of N rays passes an occupied cell, (N,) bool. The sampler is one of `Region.sampler`."""
-    space = sampler.contraction
+    """Whether each of N rays passes an occupied cell, but for its edges, (N,) bool. The sampler is one of
+    `Region.sampler`."""
+    space, coarse = sampler.contraction, replace(sampler, step=sampler.step / FINER)
     near, far = crossing(rays, torch.stack([space.centre - space.radius, space.centre + space.radius]))
     out = far > near  # the core cube, beyond which there is no region
     for rows in out.nonzero()[:, 0].split(_CHUNK):
-        out[rows] = sampler(rays[rows]).ray_offsets.diff() > 0
+        out[rows] = coarse(rays[rows]).ray_offsets.diff() > 0
     return out
 
 
