@@ -56,7 +56,8 @@ class Region:
         box = self.box
         space = Contraction(box.mean(0), float((box[1] - box[0]).max()) / 2 * 1.02)
         resolution = int(min(max(4 * space.radius / step, 64), 160))
-        empty = OccupancySampler(space, torch.zeros(resolution, resolution, resolution, dtype=torch.uint8), FINER * step)
+        nothing = torch.zeros(resolution, resolution, resolution, dtype=torch.uint8)
+        empty = OccupancySampler(space, nothing, FINER * step)
         cells = empty.cells_in(box)
         grid = empty.grid.clone()
         grid.view(-1)[cells] = self.contains(empty.points_in(cells, jitter=False)).to(torch.uint8)
