@@ -138,6 +138,20 @@ def test_interleaved_samples_are_in_order_on_every_ray() -> None:
         torch.testing.assert_close(both.t_ends[mine], wanted.sort().values + 0.1)
 
 
+def test_samples_of_what_changed_are_half_as_long() -> None:
+    base = HashField(HashFieldConfig(levels=4, finest=64, log2_table=12), BallWorld((OLD,)).sampler).eval()
+    field = UpdatedField(base.requires_grad_(False), change_of(moved(OLD, NEW_POSE)))
+    rays = views()
+    samples = field.samples(rays)
+    x, _ = samples.positions(rays)
+    core = field.sampler.contraction.reach(x) < 0.9  # beyond 1 samples are longer
+    changed = field.arrived(x) >= 0
+    assert (changed & core).sum() > 100 and (~changed & core).sum() > 100
+    length = (samples.t_ends - samples.t_starts) / field.sampler.step
+    assert torch.allclose(length[changed & core], torch.tensor(0.5), atol=1e-3)
+    torch.testing.assert_close(length[core].max(), torch.tensor(1.0), atol=1e-3, rtol=0)
+
+
 def test_leaving_out_what_is_hidden_leaves_the_picture() -> None:
     """A hash field with an opaque slab: the marched samples show what all samples show, after one visit and two."""
     sampler = BallWorld((OLD,)).sampler

@@ -144,11 +144,10 @@ def test_a_grid_that_holds_nothing_says_nothing():
 
 def test_rays_meet_a_region_as_its_cells_say():
     torch.manual_seed(1)
-    sampler, wider = (move_out(SceneChange((box_at(0.0),)), dilation).sampler(0.02) for dilation in (1.5, 1.6))
+    sampler = move_out(SceneChange((box_at(0.0),)), 1.5).sampler(0.02)
     origins = torch.randn(400, 3)
     aims = 0.6 * torch.rand(400, 3) - 0.3
     rays = Rays(origins, torch.nn.functional.normalize(aims - origins, dim=-1))
     met = meets(sampler, rays)
     assert 20 < int(met.sum()) < 380
-    assert met[sampler(rays).ray_offsets.diff() > 2].all()
-    assert not met[wider(rays).ray_offsets.diff() == 0].any()
+    assert torch.equal(met, sampler(rays).ray_offsets.diff() > 0)

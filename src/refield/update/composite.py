@@ -28,7 +28,7 @@ from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.inside import in_boxes
 from refield.scene.pose import rotate, transform
 from refield.update.light import Relighting
-from refield.update.region import FINER, Region, carved, grown, move_out
+from refield.update.region import Region, carved, finer, grown, move_out
 
 DILATION = 2.0
 """M_out is the object's grid, its box this many times as large (§10.1.3: 2 to 3)."""
@@ -194,8 +194,7 @@ class UpdatedField:
         grid."""
         if self._split_of is None or self._split_of[0] is not self.sampler.grid:
             grid, told = self.sampler.grid, self._retold
-            finer = FINER * self.sampler.step
-            parts = replace(self.sampler, grid=grid * (1 - told)), replace(self.sampler, grid=grid * told, step=finer)
+            parts = replace(self.sampler, grid=grid * (1 - told)), finer(replace(self.sampler, grid=grid * told))
             self._split_of = grid, parts
         return self._split_of[1]
 

@@ -14,9 +14,7 @@ from refield.field.warp import crossing, outline
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
 
-FINER = 0.5
-"""Length of the samples of what changed, in samples of the old field: about a pixel of its photos in place of two. A
-surface is as thick as a sample is long, and in a thick one each of a few photos may have a layer of its own."""
+_FINER = 0.5  # length of the samples of what changed, in samples of the old field: about a pixel in place of two
 _CHUNK = 65536  # rays
 
 
@@ -50,28 +48,33 @@ class Region:
     def sampler(self, step: float) -> OccupancySampler:
         """Looks everywhere in the region and nowhere else; its core cube is the region's bounding cube.
 
-        Its cells are as wide as ``step``, the length of the old field's samples, within what memory affords; its own
-        samples are shorter.
+        Its cells are as wide as a sample is long, within what memory affords.
         """
         box = self.box
         space = Contraction(box.mean(0), float((box[1] - box[0]).max()) / 2 * 1.02)
         resolution = int(min(max(4 * space.radius / step, 64), 160))
-        nothing = torch.zeros(resolution, resolution, resolution, dtype=torch.uint8)
-        empty = OccupancySampler(space, nothing, FINER * step)
+        empty = OccupancySampler(space, torch.zeros(resolution, resolution, resolution, dtype=torch.uint8), step)
         cells = empty.cells_in(box)
         grid = empty.grid.clone()
         grid.view(-1)[cells] = self.contains(empty.points_in(cells, jitter=False)).to(torch.uint8)
         return replace(empty, grid=grid)
 
 
+def finer(sampler: OccupancySampler) -> OccupancySampler:
+    """A sampler that looks where another does, with the shorter samples of what changed.
+
+    A surface is as thick as a sample is long, and in a thick one each of a few photos may have a layer of its own.
+    """
+    return replace(sampler, step=_FINER * sampler.step)
+
+
 def meets(sampler: OccupancySampler, rays: Rays) -> Tensor:
-    """Whether each of N rays passes an occupied cell, but for its edges, (N,) bool. The sampler is one of
-    `Region.sampler`."""
-    space, coarse = sampler.contraction, replace(sampler, step=sampler.step / FINER)
+    """Whether each of N rays passes an occupied cell, (N,) bool. The sampler is one of `Region.sampler`."""
+    space = sampler.contraction
     near, far = crossing(rays, torch.stack([space.centre - space.radius, space.centre + space.radius]))
     out = far > near  # the core cube, beyond which there is no region
     for rows in out.nonzero()[:, 0].split(_CHUNK):
-        out[rows] = coarse(rays[rows]).ray_offsets.diff() > 0
+        out[rows] = sampler(rays[rows]).ray_offsets.diff() > 0
     return out
 
 

@@ -28,7 +28,7 @@ from refield.update.ground import Foothold, footholds, planes_around
 from refield.update.helper import new_helper, step_near
 from refield.update.light import Relighting, Sightings, fit_light
 from refield.update.recall import earlier_of
-from refield.update.region import Region, meets, move_out
+from refield.update.region import Region, finer, meets, move_out
 from refield.update.supervision import Lessons, changed_pixels, new_lessons, old_ring, places_of
 from refield.update.unseen import sight_of
 
@@ -92,14 +92,15 @@ def update_field(
     say("supervise")
     middle = wide.box.mean(0)
     step = step_near(field, middle)
-    region = _in_reach(wide.sampler(step), capture.train + change.frames)
+    near = _in_reach(wide.sampler(step), capture.train + change.frames)
     # what earlier visits know has been taken from them already; of the rest no old photo shows anything
-    old = _old_lessons(capture, cut, region, config, light) if cut.to_learn.objects else known.sparse[:0]
+    old = _old_lessons(capture, cut, near, config, light) if cut.to_learn.objects else known.sparse[:0]
     ground = _ground(known, old, wide, eyes, max(_pixel(change, middle), step))
-    sparse = known.sparse[_some(meets(region, known.sparse.rays).nonzero()[:, 0], _NEW_RAYS)]
+    sparse = known.sparse[_some(meets(near, known.sparse.rays).nonzero()[:, 0], _NEW_RAYS)]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
     say("freeze")
+    region = finer(near)
     sight = sight_of(cut.pretrained, capture.train, _beside(wide))
     frozen = lit(region=wide).unshown(sight.hidden)
     new_taught, judge = _split(Lit(sparse, _fixed(frozen, region, sparse.rays, ground)), config.held_out)
