@@ -29,6 +29,7 @@ from refield.scene.inside import in_boxes
 from refield.scene.pose import rotate, transform
 from refield.update.light import Relighting
 from refield.update.region import Region, carved, finer, grown, move_out
+from refield.update.textured import TexturedPlane
 
 DILATION = 2.0
 """M_out is the object's grid, its box this many times as large (§10.1.3: 2 to 3)."""
@@ -70,6 +71,7 @@ class Earlier:
 
 
 NOTHING_EARLIER = Earlier()
+_DEPTH = 10.0  # optical depth of a sample that meets a textured plane
 _SOLID = 0.05  # opacity of a sample that was not empty before
 _LAYER = 10  # nodes of a grid that make a layer
 _NODES = 500  # of a grid, that are asked instead of all
@@ -128,6 +130,7 @@ class UpdatedField:
         self.outlooks = tuple(None if eyes is None else Outlook.from_eyes(eyes, m.grid) for m in self.moves)
         self.sources = tuple(source_of(pretrained, m.grid) for m in self.moves)
         self.boxes = tuple(m.box_now for m in self._shells) + region.boxes + earlier.places.boxes
+        self._opaque = _DEPTH / finer(pretrained.sampler).step  # density of a plane whose texture is known
         self._base: HashField | NerfactoField | None = _base_of(pretrained)
         self._told, self._nothing = self._told_cells(pretrained.sampler)
         none = pretrained.sampler.grid.new_zeros(0, dtype=torch.long)
@@ -219,8 +222,8 @@ class UpdatedField:
             x = sampler.points_in(cells, jitter=False)
             to = self._route(x)
             told = to.owner >= 0
-            told[to.helper] = True
-            told[to.ground] = True
+            for rows in (to.helper, to.ground, to.textured):
+                told[rows] = True
             grid.view(-1)[cells[told]] = 1
             if self.earlier.ground is not None:
                 empty.append(cells[to.ground[~self.earlier.ground.sampler.occupied(x[to.ground])]])
@@ -236,6 +239,8 @@ class UpdatedField:
         for field, rows in ((self.helper, to.helper), (self.earlier.ground, to.ground)):
             if field is not None and len(rows):
                 sigma = sigma.index_copy(0, rows, field.density(flat[rows]))
+        for plane, rows in to.planes:
+            sigma = sigma.index_copy(0, rows, self._opaque * plane.opaque(flat[rows]))
         return sigma.reshape(x.shape[:-1])
 
     def __call__(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
@@ -258,6 +263,9 @@ class UpdatedField:
             s, c = self.earlier.ground(flat[to.ground], along[to.ground])
             c = self._relit(flat[to.ground], c, to.owner[to.ground])
             sigma, rgb = sigma.index_copy(0, to.ground, s), rgb.index_copy(0, to.ground, c)
+        for plane, rows in to.planes:
+            sigma = sigma.index_copy(0, rows, self._opaque * plane.opaque(flat[rows]))
+            rgb = rgb.index_copy(0, rows, plane.colours(flat[rows], along[rows]))
         return sigma.reshape(x.shape[:-1]), rgb.reshape(x.shape)
 
     def _route(self, x: Tensor, d: Tensor | None = None) -> _Routed:
@@ -267,13 +275,18 @@ class UpdatedField:
         owner = torch.full(x.shape[:1], -1, dtype=torch.long, device=x.device)
         near = self._near(x.detach()).nonzero()[:, 0]
         if len(near) == 0:
-            return _Routed(x, d, owner, torch.arange(len(x), device=x.device), near, near, ())
+            return _Routed(x, d, owner, torch.arange(len(x), device=x.device), near, near, (), ())
         mover = self.arrived(x[near])
         owner[near] = mover
-        helped = (mover < 0) & self.region.contains(x[near])
+        planes, textured = [], torch.zeros_like(near, dtype=torch.bool)
+        for plane in self.region.planes:
+            mine = (mover < 0) & ~textured & plane.contains(x[near])
+            planes.append((plane, near[mine]))
+            textured |= mine
+        helped = (mover < 0) & ~textured & Region(self.region.grids).contains(x[near])
         if self.untaught.grids:
             helped &= ~self.untaught.contains(x[near]) | self._was.contains(x[near])
-        grounded = (mover < 0) & ~helped & self.earlier.places.contains(x[near])
+        grounded = (mover < 0) & ~textured & ~helped & self.earlier.places.contains(x[near])
         at, along = looked_up(x[near], d[near], mover, [m.old_from_new for m in self.moves])
         sourced = []
         for i, (outlook, source) in enumerate(zip(self.outlooks, self.sources)):
@@ -287,10 +300,12 @@ class UpdatedField:
                 along = along.index_copy(0, mine, outlook.held(at[mine], along[mine]))
         asked, turned = x.index_copy(0, near, at), d.index_copy(0, near, along)
         old = torch.ones(len(x), dtype=torch.bool, device=x.device)
-        old[near] = ~(helped | grounded)
+        old[near] = ~(helped | grounded | textured)
         for found in sourced:
             old[found.rows] = False
-        return _Routed(asked, turned, owner, old.nonzero()[:, 0], near[helped], near[grounded], tuple(sourced))
+        return _Routed(
+            asked, turned, owner, old.nonzero()[:, 0], near[helped], near[grounded], tuple(sourced), tuple(planes)
+        )
 
     def arrived(self, x: Tensor) -> Tensor:
         """Which move each world point (S, 3) is answered by, (S,) int64, -1 for none.
@@ -318,7 +333,7 @@ class UpdatedField:
 
     def _vacated(self, x: Tensor) -> Tensor:
         """Whether world points (S, 3) are around where something left, now or at an earlier visit, (S,) bool."""
-        return self.region.contains(x) | self.earlier.places.contains(x)
+        return Region(self.region.grids).contains(x) | self.earlier.places.contains(x)
 
     def _up_of(self, move: Move, shell: Move) -> Tensor | None:
         """(3,) world: a sample's length away from what a moved object stands on now; None if on nothing.
@@ -379,6 +394,13 @@ class _Routed:
     """rows of the earlier state that knows the place"""
     sourced: tuple[_Sourced, ...]
     """what moved before, and is looked up where it first was"""
+    planes: tuple[tuple[TexturedPlane, Tensor], ...]
+    """planes whose texture is known, each with its rows"""
+
+    @property
+    def textured(self) -> Tensor:
+        """rows of all planes"""
+        return torch.cat([self.helper[:0], *(rows for _, rows in self.planes)])
 
 
 def some_of(grid: OccupancyGrid) -> Tensor:
@@ -395,7 +417,7 @@ def source_of(field: Field, grid: OccupancyGrid) -> Source | None:
     x = some_of(grid)
     to = field._route(x)
     owner = to.owner.clone()
-    owner[to.helper] = owner[to.ground] = -2
+    owner[to.helper] = owner[to.ground] = owner[to.textured] = -2
     i = int(owner.mode().values) if len(x) else -2
     if i == -2 or float((owner == i).float().mean()) < _WHOLE:
         return None

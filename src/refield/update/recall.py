@@ -85,7 +85,7 @@ def without(field: Field, origin: Origin, *, departed: bool) -> Field:
     moving = [k for k, q in enumerate(field.change.objects) if q.new_from_old is not None and k not in field.skipped]
     shading = tuple(s for k, s in zip(moving, field.shading) if k != own)
     bare = _bare_of(field, o)
-    region = Region(tuple(g for g in field.region.grids if not _among(g, bare)))
+    region = replace(field.region, grids=tuple(g for g in field.region.grids if not _among(g, bare)))
     kept = Region(tuple(g for g in field.bare.grids if not _among(g, bare)))
     if departed and o.kind == "moved":
         gone = ObjectChange("removed", o.grid, masks=o.masks, confidence=o.confidence, note=o.note)
@@ -207,4 +207,4 @@ def _less(region: Region, grid: OccupancyGrid, but: Region) -> Region:
     if not own:
         return region
     nearest = min(own, key=lambda g: float((g.tight_aabb().mean(0) - centre).norm()))
-    return Region(tuple(g for g in region.grids if g is not nearest))
+    return replace(region, grids=tuple(g for g in region.grids if g is not nearest))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,6 +14,7 @@ from refield.field.sampling import OccupancySampler
 from refield.field.warp import crossing, outline
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
+from refield.update.textured import TexturedPlane
 
 _FINER = 0.5  # length of the samples of what changed, in samples of the old field: about a pixel in place of two
 _CHUNK = 65536  # rays
@@ -20,19 +22,20 @@ _CHUNK = 65536  # rays
 
 @dataclass(frozen=True)
 class Region:
-    """A union of grids in the world."""
+    """A union of grids in the world, and planes whose texture is known."""
 
     grids: tuple[OccupancyGrid, ...]
+    planes: tuple[TexturedPlane, ...] = ()
 
     @cached_property
     def boxes(self) -> tuple[Tensor, ...]:
-        """A (2, 3) world box around each grid."""
-        return tuple(outline(g) for g in self.grids)
+        """A (2, 3) world box around each grid and each plane."""
+        return tuple(outline(g) for g in self.grids) + tuple(p.box for p in self.planes)
 
     @property
     def box(self) -> Tensor:
         """(2, 3) around them all. Raises ValueError if there is none."""
-        if not self.grids:
+        if not self.boxes:
             raise ValueError("an empty region has no box")
         boxes = torch.stack(self.boxes)
         return torch.stack([boxes[:, 0].amin(0), boxes[:, 1].amax(0)])
@@ -43,6 +46,8 @@ class Region:
         found = torch.zeros(len(flat), dtype=torch.bool, device=x.device)
         for grid in self.grids:
             found |= grid.contains(flat)
+        for plane in self.planes:
+            found |= plane.contains(flat)
         return found.reshape(x.shape[:-1])
 
     def sampler(self, step: float) -> OccupancySampler:
@@ -66,6 +71,16 @@ def finer(sampler: OccupancySampler) -> OccupancySampler:
     A surface is as thick as a sample is long, and in a thick one each of a few photos may have a layer of its own.
     """
     return replace(sampler, step=_FINER * sampler.step)
+
+
+def above(sampler: OccupancySampler, planes: Sequence[TexturedPlane]) -> OccupancySampler:
+    """A sampler that looks where another does, but not into cells in or beneath planes whose texture is known."""
+    grid = sampler.grid.clone()
+    for plane in planes:
+        cells = grid.view(-1).nonzero()[:, 0]
+        x = sampler.points_in(cells, jitter=False)
+        grid.view(-1)[cells[(plane.height(x) <= plane.clear) & plane.over(plane.known, x)]] = 0
+    return replace(sampler, grid=grid)
 
 
 def meets(sampler: OccupancySampler, rays: Rays) -> Tensor:

@@ -17,6 +17,7 @@ from refield.update.composite import Earlier, Origin, UpdatedField
 from refield.update.light import Relighting
 from refield.update.recall import ground_of, without
 from refield.update.region import Region
+from refield.update.textured import TexturedPlane
 
 _REMEDY = "restore the visit, or remove it and update again"
 
@@ -35,6 +36,9 @@ def save_updated(folder: Path, field: UpdatedField) -> None:
         "helper": None,
     }
     tensors |= _region_out("region", field.region) | _region_out("bare", field.bare)
+    facts["planes"] = len(field.region.planes)
+    for i, plane in enumerate(field.region.planes):
+        tensors |= _plane_out(f"plane.{i}", plane)
     for name, known in (("places", field.earlier.places), ("unknown", field.earlier.unknown)):
         tensors |= _region_out(name, known)
         facts[name] = len(known.grids)
@@ -66,6 +70,10 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
     tensors, facts = read_tensors(folder)
     try:
         region = _region_in("region", facts["regions"], tensors)
+        planes = tuple(
+            _plane_in(f"plane.{i}", tensors) for i in range(facts.get("planes", 0))
+        )  # older visits have none
+        region = replace(region, planes=planes)
         bare = _region_in("bare", facts["bare"], tensors)
         light = _light_in("light", tensors)
         shading = tuple(_light_in(f"shading.{i}", tensors) for i in range(facts["shading"]))
@@ -112,6 +120,20 @@ def _region_out(name: str, region: Region) -> dict[str, Tensor]:
 def _region_in(name: str, count: int, tensors: dict[str, Tensor]) -> Region:
     keys = [f"{name}.{i}" for i in range(count)]
     return Region(tuple(OccupancyGrid(tensors[f"{k}.aabb"], tensors[f"{k}.values"]) for k in keys))
+
+
+def _plane_out(name: str, plane: TexturedPlane) -> dict[str, Tensor]:
+    sizes = torch.tensor([plane.texel, plane.depth, plane.clear], dtype=torch.float64)
+    parts = {"normal": plane.normal, "origin": plane.origin, "axes": plane.axes, "rgb": plane.rgb, "known": plane.known}
+    return {f"{name}.{key}": part for key, part in (parts | {"sizes": sizes}).items()}
+
+
+def _plane_in(name: str, tensors: dict[str, Tensor]) -> TexturedPlane:
+    normal, origin, axes, rgb, known = (
+        tensors[f"{name}.{key}"] for key in ("normal", "origin", "axes", "rgb", "known")
+    )
+    texel, depth, clear = tensors[f"{name}.sizes"].tolist()
+    return TexturedPlane(normal, origin, axes, texel, depth, clear, rgb, known)
 
 
 def _light_out(name: str, light: Relighting | None) -> dict[str, Tensor]:

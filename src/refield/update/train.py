@@ -23,13 +23,15 @@ from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.evidence import as_remembered, recalled_pixels
 from refield.update.fit_helper import HelperTraining, Lit, UpdateProgress
+from refield.update.fit_textured import textured_planes
 from refield.update.frozen import Segments, composite_once
 from refield.update.ground import Foothold, footholds, planes_around
 from refield.update.helper import new_helper, step_near
 from refield.update.light import Relighting, Sightings, fit_light
 from refield.update.recall import earlier_of
-from refield.update.region import Region, finer, meets, move_out
+from refield.update.region import Region, above, finer, meets, move_out
 from refield.update.supervision import Lessons, changed_pixels, new_lessons, old_ring, places_of
+from refield.update.textured import TexturedPlane
 from refield.update.unseen import sight_of
 
 DEFAULTS = UpdateConfig()
@@ -96,14 +98,22 @@ def update_field(
     # what earlier visits know has been taken from them already; of the rest no old photo shows anything
     old = _old_lessons(capture, cut, near, config, light) if cut.to_learn.objects else known.sparse[:0]
     ground = _ground(known, old, wide, eyes, max(_pixel(change, middle), step))
-    sparse = known.sparse[_some(meets(near, known.sparse.rays).nonzero()[:, 0], _NEW_RAYS)]
+    rows = _some(meets(near, known.sparse.rays).nonzero()[:, 0], _NEW_RAYS)
+    held = _held_out(rows, config.held_out)
+    sparse = known.sparse[rows]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
     say("freeze")
-    region = finer(near)
-    sight = sight_of(cut.pretrained, capture.train, _beside(wide))
+    wide = Region(wide.grids, _textured(known, ground, config, _pixel(change, middle)))
+    region = finer(above(near, wide.planes))
+    if not region.grid.any():
+        updated = lit(region=wide)
+        updated.why_stopped = "the ground is all there is to know"
+        return updated
+    sight = sight_of(cut.pretrained, capture.train, _beside(Region(wide.grids)))
     frozen = lit(region=wide).unshown(sight.hidden)
-    new_taught, judge = _split(Lit(sparse, _fixed(frozen, region, sparse.rays, ground)), config.held_out)
+    lit_new = Lit(sparse, _fixed(frozen, region, sparse.rays, ground))
+    new_taught, judge = (Lit(sparse[r], lit_new.fixed[r]) for r in ((~held).nonzero()[:, 0], held.nonzero()[:, 0]))
     old_taught = Lit(old, _fixed(frozen, region, old.rays, ground))
     say("train")
     helper = new_helper(region, change.frames, config.seed)
@@ -151,19 +161,32 @@ def _fixed(frozen: UpdatedField, region: OccupancySampler, rays: Rays, ground: S
     """What is fixed along rays. Nothing beyond the ground that an object stood on: nobody has ever looked through it,
     and where the old field's inside shows as through a mist, a helper needs not become solid."""
     fixed = composite_once(frozen, region, rays)
+    textured = torch.zeros(len(rays), dtype=torch.bool)
+    for plane in frozen.region.planes:
+        textured |= plane.hit(rays)
     for foothold in ground:
-        fixed = fixed.before(foothold.entered(rays))
+        fixed = fixed.before(torch.where(textured, torch.inf, foothold.entered(rays)))
     return fixed
 
 
-def _split(lit: Lit, every: int) -> tuple[Lit, Lit]:
-    """What may be drawn, and every so-many-th ray to judge by."""
-    index = torch.arange(len(lit.lessons))
+def _held_out(rows: Tensor, every: int) -> Tensor:
+    """Which pixels of the new photos, rows (K,) of all of them, are kept to judge by, (K,) bool."""
     every = max(every, 2)  # something has to be left to learn from
-    kept = (index % every) == every // 2
-    parts = [(~kept).nonzero()[:, 0], kept.nonzero()[:, 0]]
-    taught, judge = (Lit(lit.lessons[p], lit.fixed[p]) for p in parts)
-    return taught, judge
+    return rows % every == every // 2
+
+
+def _textured(
+    known: _Known, ground: Sequence[Foothold], config: UpdateConfig, pixel: float
+) -> tuple[TexturedPlane, ...]:
+    """The texture of the ground that objects stood on, and of what is beside these places and the new ones."""
+    if not ground:
+        return ()
+    cut, sparse = known.cut, known.sparse
+    places = [g for o in cut.to_learn.objects for g in (o.grid, o.grid_now) if g is not None]
+    around = Region(tuple(g.dilated(config.ground) for g in places) + cut.earlier.unknown.grids)
+    arrived = tuple(g for o in cut.change.objects if (g := o.grid_now) is not None)
+    taught = sparse[(~_held_out(torch.arange(len(sparse)), config.held_out)).nonzero()[:, 0]]
+    return textured_planes(ground, around, cut, Region(arrived + cut.bare.grids), taught, pixel)
 
 
 def _in_reach(region: OccupancySampler, frames: tuple[Frame, ...]) -> OccupancySampler:
