@@ -183,7 +183,9 @@ def ours(lab: Lab, case: Case) -> Record:
 
 def no_adjacent(lab: Lab, case: Case) -> Record:
     """×OA: the helper only inside the object's own grid, and old photos teach nothing around it (Fig. 9b)."""
-    return _updated(lab, case, "no_adjacent", change_of(lab, case), replace(lab.update, dilation=1.0, far=0.0))
+    return _updated(
+        lab, case, "no_adjacent", change_of(lab, case), replace(lab.update, dilation=1.0, ground=1.0, far=0.0)
+    )
 
 
 def no_old(lab: Lab, case: Case) -> Record:

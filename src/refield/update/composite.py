@@ -278,14 +278,15 @@ class UpdatedField:
             return _Routed(x, d, owner, torch.arange(len(x), device=x.device), near, near, (), ())
         mover = self.arrived(x[near])
         owner[near] = mover
-        planes, textured = [], torch.zeros_like(near, dtype=torch.bool)
+        free = mover < 0
+        if self.untaught.grids:
+            free &= ~self.untaught.contains(x[near]) | self._was.contains(x[near])
+        planes, textured = [], torch.zeros_like(free)
         for plane in self.region.planes:
-            mine = (mover < 0) & ~textured & plane.contains(x[near])
+            mine = free & ~textured & plane.contains(x[near])
             planes.append((plane, near[mine]))
             textured |= mine
-        helped = (mover < 0) & ~textured & Region(self.region.grids).contains(x[near])
-        if self.untaught.grids:
-            helped &= ~self.untaught.contains(x[near]) | self._was.contains(x[near])
+        helped = free & ~textured & Region(self.region.grids).contains(x[near])
         grounded = (mover < 0) & ~textured & ~helped & self.earlier.places.contains(x[near])
         at, along = looked_up(x[near], d[near], mover, [m.old_from_new for m in self.moves])
         sourced = []

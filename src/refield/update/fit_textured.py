@@ -77,7 +77,7 @@ def _textured(
 ) -> TexturedPlane | None:
     blank = _blank(plane, around, cut, pixel)
     shape = tuple(blank.known.shape)
-    nodes = blank.at(torch.cartesian_prod(*(torch.arange(float(n)) for n in shape)))
+    nodes = blank.nodes
     inside = around.contains(nodes)
     under = cut.region.contains(nodes) | cut.region.contains(nodes + blank.clear * blank.normal)
     for foothold in ground:

@@ -16,8 +16,8 @@ from refield.field.radiance import Field
 from refield.field.warp import Move, inside_box, outline
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.pose import transform
-from refield.update.composite import Earlier, Origin, UpdatedField, layers_of, some_of
-from refield.update.region import Region, carved, grown, move_out
+from refield.update.composite import DILATION, Earlier, Origin, UpdatedField, layers_of, some_of
+from refield.update.region import Region, carved, forgotten, grown, move_out
 
 _SAME = 0.5  # of one grid's nodes that lie in the other
 _BACK = 0.06  # of an object's mean side: so near to its old place it may be back there; the photos decide
@@ -94,6 +94,7 @@ def without(field: Field, origin: Origin, *, departed: bool) -> Field:
         assert o.new_from_old is not None  # it moved
         stood = grown(o.grid.moved(o.new_from_old), _TAUGHT * field.pretrained.sampler.step)
         untaught = Region((*field.untaught.grids, stood))
+        region = _unshaded(region, o)
         return _rebuilt(
             field, field.pretrained, change=change, region=region, bare=kept, shading=shading, untaught=untaught
         )
@@ -106,6 +107,7 @@ def without(field: Field, origin: Origin, *, departed: bool) -> Field:
         earlier = replace(earlier, places=_less(earlier.places, o.grid, kept))
     else:
         region = _less(region, o.grid, kept)
+    region = _unshaded(region, o)
     return _rebuilt(
         field, field.pretrained, region=region, bare=kept, shading=shading, earlier=earlier, skipped=skipped
     )
@@ -197,6 +199,13 @@ def _bare_of(field: UpdatedField, o: ObjectChange) -> list[Tensor]:
 
 def _among(grid: OccupancyGrid, boxes: list[Tensor]) -> bool:
     return any(torch.equal(grid.aabb, box) for box in boxes)
+
+
+def _unshaded(region: Region, o: ObjectChange) -> Region:
+    """A region without what its planes show around an object, whose shadow is on them; but where a helper would have to
+    show it, which has not learnt what a plane does."""
+    around = Region(tuple(g.dilated(DILATION) for g in (o.grid, o.grid_now) if g is not None))
+    return replace(region, planes=forgotten(region.planes, around, Region(region.grids)))
 
 
 def _less(region: Region, grid: OccupancyGrid, but: Region) -> Region:

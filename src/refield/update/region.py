@@ -73,6 +73,12 @@ def finer(sampler: OccupancySampler) -> OccupancySampler:
     return replace(sampler, step=_FINER * sampler.step)
 
 
+def forgotten(planes: Sequence[TexturedPlane], places: Region, but: Region) -> tuple[TexturedPlane, ...]:
+    """Planes without what they know of some places, but for some others."""
+    gone = [(places.contains(p.nodes) & ~but.contains(p.nodes)).reshape(p.known.shape) for p in planes]
+    return tuple(replace(p, known=p.known & ~g) for p, g in zip(planes, gone) if (p.known & ~g).any())
+
+
 def above(sampler: OccupancySampler, planes: Sequence[TexturedPlane]) -> OccupancySampler:
     """A sampler that looks where another does, but not into cells in or beneath planes whose texture is known."""
     grid = sampler.grid.clone()

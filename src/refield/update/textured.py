@@ -53,6 +53,11 @@ class TexturedPlane:
         both = torch.cat([corners - self.depth * self.normal, corners + self.clear * self.normal])
         return torch.stack([both.amin(0), both.amax(0)])
 
+    @cached_property
+    def nodes(self) -> Tensor:
+        """(U * V, 3) world: the texels' centres."""
+        return self.at(torch.cartesian_prod(*(torch.arange(float(n)) for n in self.known.shape)))
+
     def at(self, texels: Tensor) -> Tensor:
         """Places in texels (N, 2) -> world points (N, 3)."""
         return self.origin + self.texel * (texels @ self.axes)

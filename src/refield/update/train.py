@@ -182,7 +182,7 @@ def _textured(
     if not ground:
         return ()
     cut, sparse = known.cut, known.sparse
-    places = [g for o in cut.to_learn.objects for g in (o.grid, o.grid_now) if g is not None]
+    places = [o.grid for o in cut.to_learn.objects] + [m.grid.moved(m.new_from_old) for m in cut.moves]
     around = Region(tuple(g.dilated(config.ground) for g in places) + cut.earlier.unknown.grids)
     arrived = tuple(g for o in cut.change.objects if (g := o.grid_now) is not None)
     taught = sparse[(~_held_out(torch.arange(len(sparse)), config.held_out)).nonzero()[:, 0]]
