@@ -1,6 +1,7 @@
 """An updated field that was saved and loaded is the same field."""
 
 import inspect
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,7 +14,9 @@ from refield.scene.errors import InputError
 from refield.scene.pose import exp
 from refield.update.composite import UpdatedField
 from refield.update.light import Relighting
+from refield.update.region import Region
 from refield.update.store import load_updated, save_updated
+from refield.update.textured import TexturedPlane
 from tests.fields import small_field
 
 STORED = {"bare", "eyes", "pretrained", "change", "helper", "region", "light", "shading", "sampler", "earlier"}
@@ -22,6 +25,13 @@ STORED = {"bare", "eyes", "pretrained", "change", "helper", "region", "light", "
 def a_light(seed: int) -> Relighting:
     box = torch.tensor([[-0.8, -0.8, -0.8], [0.8, 0.8, 0.8]])
     return Relighting(box, torch.randn(4, 4, 4, 3, generator=torch.Generator().manual_seed(seed)) * 0.3)
+
+
+def a_plane() -> TexturedPlane:
+    up, axes = torch.tensor([0.0, 0.6, 0.8]), torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.8, -0.6]])
+    rgb = torch.rand(30, 20, 3, generator=torch.Generator().manual_seed(4))
+    known = torch.rand(30, 20, generator=torch.Generator().manual_seed(5)) > 0.3
+    return TexturedPlane(up, torch.tensor([-0.5, 0.1, 0.2]), axes, 0.03, 0.2, 0.1, rgb, known)
 
 
 def a_change() -> SceneChange:
@@ -37,16 +47,23 @@ def test_round_trip(tmp_path, helped, lit):
     old, change = small_field(0), a_change()
     light, shading = (a_light(1), (a_light(2),)) if lit else (None, (None,))
     helper = small_field(3) if helped else None
-    field = UpdatedField(old, change, helper, light=light, shading=shading).unshown(torch.tensor([1200, 2100]))
+    region = replace(UpdatedField(old, change, helper).region, planes=(a_plane(),))
+    field = UpdatedField(old, change, helper, region=region, light=light, shading=shading)
+    field = field.unshown(torch.tensor([1200, 2100]))
     save_updated(tmp_path, field)
     back = load_updated(tmp_path, old, change)
     x = torch.rand(3000, 3) * 2 - 1
     d = torch.nn.functional.normalize(torch.randn(3000, 3), dim=-1)
     for ours, theirs in zip(field(x, d), back(x, d)):
         assert torch.equal(ours, theirs)
+    assert field.region.contains(x).sum() > region_without(field).contains(x).sum()
     assert torch.equal(field.sampler.grid, back.sampler.grid) and torch.equal(field.unseen, back.unseen)
     rays = Rays(torch.tensor([[0.0, 0.0, -3.0]]).expand(200, 3), torch.nn.functional.normalize(-x[:200] + 3, dim=-1))
     assert torch.equal(render_rays(field, rays).rgb, render_rays(back, rays).rgb)
+
+
+def region_without(field: UpdatedField) -> Region:
+    return replace(field.region, planes=())
 
 
 def test_nothing_is_forgotten():

@@ -10,6 +10,7 @@ Letters: (U, V) texels, N pixels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -42,6 +43,8 @@ _CLEAR = 0.1  # opacity of what may be in front of the ground
 _ON = 1.5  # samples of the old field; so near to a plane its surface is the plane's
 _APART = 4  # texels; so far apart a photo's pixels may be on the ground
 _FEWEST = 100  # pixels
+_SOME = 6  # of a photo's pixels, whose mean says how a place looks in it
+_DISPUTED = 0.12  # of a colour channel in [0, 1]; so different a place may not look in two photos
 _ROUNDS = 6  # of texture, trust and plane
 _OFF = 0.5  # samples of the old field; so far off a plane may well be
 _SPREAD = 3.0  # typical errors; as wrong as this is half trusted
@@ -94,10 +97,11 @@ def _textured(
     if len(used) < _FEWEST:
         return None
     colours = ((seen.rgb - rgb) / (1 - hidden)[:, None])[used]
-    fitted = _fitted(blank, seen.rays[used], colours.double().numpy(), _Guide(guide.double().numpy(), beside.numpy()))
-    refuted = _counted(fitted.wrong, shape) > _counted(fitted.right, shape)
-    known = (beside.numpy() | (under.numpy() & _among(fitted.right, shape))) & ~refuted
-    return replace(fitted.plane, known=torch.from_numpy(known)) if known.any() else None
+    told = colours.double().numpy()
+    found, places = _fitted(blank, seen.rays[used], told, _Guide(guide.double().numpy(), beside.numpy()))
+    known = beside.numpy() | (under.numpy() & _among(places, shape))
+    known &= ~_disputed(places, told, seen.photo[used].numpy(), shape)
+    return replace(found, known=torch.from_numpy(known)) if known.any() else None
 
 
 def _blank(plane: Plane, around: Region, field: Field, pixel: float) -> TexturedPlane:
@@ -151,9 +155,23 @@ def _hits(places: Array, shape: tuple[int, ...]) -> Array:
     return counts
 
 
-def _counted(places: Array, shape: tuple[int, ...]) -> Array:
-    """How many places (N, 2) there are around each texel, (U, V) float64."""
-    return ndimage.convolve(_hits(places, shape), np.ones((2 * _APART + 1,) * 2), mode="constant")
+def _disputed(places: Array, colours: Array, photo: Array, shape: tuple[int, ...]) -> Array:
+    """Texels that do not look the same in all photos that show them, (U, V) bool.
+
+    Means over some pixels are compared: a texture fine enough for one photo fits several that contradict each other.
+    """
+    blocks = tuple(-(-n // _APART) for n in shape)
+    at = np.ravel_multi_index(tuple(np.clip(places.round().astype(int) // _APART, 0, np.array(blocks) - 1).T), blocks)
+    least, most = np.full((*blocks, 3), np.inf), np.full((*blocks, 3), -np.inf)
+    for k in np.unique(photo):
+        mine = photo == k
+        sums = [np.bincount(at[mine], w, math.prod(blocks)).reshape(blocks) for w in (None, *colours[mine].T)]
+        count, *summed = (ndimage.convolve(s.astype(float), np.ones((3, 3)), mode="constant") for s in sums)
+        some = count >= _SOME
+        mean = np.stack(summed, -1)[some] / count[some, None]
+        least[some], most[some] = np.minimum(least[some], mean), np.maximum(most[some], mean)
+    apart = (most - least).max(-1) > _DISPUTED
+    return np.kron(apart, np.ones((_APART, _APART), bool))[: shape[0], : shape[1]]
 
 
 def _among(places: Array, shape: tuple[int, ...]) -> Array:
@@ -174,17 +192,8 @@ class _Guide:
     """(U, V) bool"""
 
 
-@dataclass(frozen=True)
-class _Fitted:
-    plane: TexturedPlane
-    right: Array
-    """(K, 2) places on it, in texels, of pixels whose colours it shows"""
-    wrong: Array
-    """of those that show something else"""
-
-
-def _fitted(plane: TexturedPlane, rays: Rays, colours: Array, guide: _Guide) -> _Fitted:
-    """The plane that shows colours (N, 3) best to rays that come to it.
+def _fitted(plane: TexturedPlane, rays: Rays, colours: Array, guide: _Guide) -> tuple[TexturedPlane, Array]:
+    """The plane that shows colours (N, 3) best to rays that come to it, and where these do, (N, 2) texels.
 
     Least squares, reweighted as for Cauchy's errors, for the texture, and in turns with it a Gauss-Newton step for how
     far the plane is off: its height and its two tilts. One photo says nothing about that, and it stays.
@@ -213,7 +222,7 @@ def _fitted(plane: TexturedPlane, rays: Rays, colours: Array, guide: _Guide) -> 
             off = off - np.linalg.solve(pull @ lever + stay * np.eye(3), pull @ error.reshape(-1) + stay * off)
             places = first + slide * (levers @ off)[:, None]
     picture = torch.from_numpy((texture + mean).reshape(*shape, 3)).float().clamp(0, 1)
-    return _Fitted(replace(_raised(plane, off), rgb=picture), places[trust > 0.5], places[trust <= 0.5])
+    return replace(_raised(plane, off), rgb=picture), places
 
 
 def _raised(plane: TexturedPlane, off: Array) -> TexturedPlane:
