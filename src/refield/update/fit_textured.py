@@ -37,7 +37,7 @@ from refield.update.textured import TexturedPlane
 
 Array = NDArray[Any]
 _TEXEL = 0.5  # pixels of the nearest new photo
-_SIDE = 1024  # texels at most
+_SIDE = 640  # texels at most
 _SMOOTH = 0.3  # weight of a difference between neighbouring texels, where a pixel has 1
 _CLEAR = 0.1  # opacity of what may be in front of the ground
 _ON = 1.5  # samples of the old field; so near to a plane its surface is the plane's

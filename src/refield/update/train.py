@@ -103,17 +103,16 @@ def update_field(
     sparse = known.sparse[rows]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
+    planes = _textured(known, ground, config, _pixel(change, middle))
     say("freeze")
-    wide = Region(wide.grids, _textured(known, ground, config, _pixel(change, middle)))
-    region = finer(above(near, wide.planes))
+    told, region = Region(wide.grids, planes), finer(above(near, planes))
+    sight = sight_of(cut.pretrained, capture.train, _beside(wide))
+    frozen = lit(region=told).unshown(sight.hidden)
     if not region.grid.any():
-        updated = lit(region=wide)
-        updated.why_stopped = "the ground is all there is to know"
-        return updated
-    sight = sight_of(cut.pretrained, capture.train, _beside(Region(wide.grids)))
-    frozen = lit(region=wide).unshown(sight.hidden)
-    lit_new = Lit(sparse, _fixed(frozen, region, sparse.rays, ground))
-    new_taught, judge = (Lit(sparse[r], lit_new.fixed[r]) for r in ((~held).nonzero()[:, 0], held.nonzero()[:, 0]))
+        frozen.why_stopped = "there is nothing but the ground to show"
+        return frozen
+    fixed = _fixed(frozen, region, sparse.rays, ground)
+    new_taught, judge = (Lit(sparse[r], fixed[r]) for r in ((~held).nonzero()[:, 0], held.nonzero()[:, 0]))
     old_taught = Lit(old, _fixed(frozen, region, old.rays, ground))
     say("train")
     helper = new_helper(region, change.frames, config.seed)
@@ -121,7 +120,7 @@ def update_field(
     run.run(on_progress)
     say("show")
     helper.requires_grad_(False)
-    updated = lit(helper=helper, region=wide).unshown(sight.hidden)
+    updated = lit(helper=helper, region=told).unshown(sight.hidden)
     updated.why_stopped = run.why_stopped
     return updated
 
