@@ -87,13 +87,18 @@ def _textured(
         under |= foothold.holds(nodes)
     on, guide = _shown(cut.pretrained, blank, nodes)
     inside, under, beside = (m.reshape(shape) for m in (inside, inside & under, inside & on & ~under))
-    seen = new[replace(blank, known=beside | under).hit(new.rays).nonzero()[:, 0]]
+    seen = new[replace(blank, known=inside).hit(new.rays).nonzero()[:, 0]]
     t = blank.met(seen.rays)
     steep = -(seen.rays.directions @ blank.normal).clamp(max=-_GRAZING)
     hidden, rgb = _in_front(cut, seen.rays, t - _ON * blank.clear / steep)
     for grid in unsure.grids:
         hidden[grid.met_by(seen.rays)] = 1.0
-    used = (hidden < _CLEAR).nonzero()[:, 0]
+    x = seen.rays.origins + t[:, None] * seen.rays.directions
+    free = hidden < _CLEAR
+    # a plain piece of ground may have no surface in the old field; rays that come to it freely say that it is there
+    whole = torch.from_numpy(ndimage.binary_fill_holes((beside | under).numpy()))
+    under |= whole & inside & ~beside & torch.from_numpy(_among(blank.texels(x[free]).numpy(), shape))
+    used = (free & blank.over(beside | under, x)).nonzero()[:, 0]
     if len(used) < _FEWEST:
         return None
     colours = ((seen.rgb - rgb) / (1 - hidden)[:, None])[used]
