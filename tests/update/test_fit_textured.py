@@ -69,8 +69,9 @@ def photos(world: Field, turns: Sequence[float]) -> Lessons:
 
 def found(lessons: Lessons, plane: Plane = LEVEL, unsure: Region = NOWHERE) -> tuple[TexturedPlane, ...]:
     cut = UpdatedField(BallWorld((OLD,)), CHANGE)
+    dark = replace(cut.sampler, grid=torch.zeros_like(cut.sampler.grid))
     ground = footholds([CHANGE.objects[0].grid], [plane])
-    return textured_planes(ground, move_out(CHANGE, 2.0), cut, unsure, lessons, PIXEL)
+    return textured_planes(ground, move_out(CHANGE, 2.0), cut, dark, unsure, lessons, PIXEL)
 
 
 def seen(plane: TexturedPlane, truth: Field, radius: float = 1.0) -> tuple[float, float]:
@@ -133,5 +134,28 @@ def test_what_stands_there_is_not_painted_on_the_ground() -> None:
 
 def test_photos_that_do_not_show_it_say_nothing() -> None:
     lessons = photos(AFTER, [0.4])
-    assert found(lessons[lessons.rays.directions[:, 2] > 0]) == ()
-    assert textured_planes([], move_out(CHANGE, 2.0), UpdatedField(AFTER, CHANGE), Region(()), lessons, PIXEL) == ()
+    x = lessons.rays.origins + lessons.rays.directions * (-lessons.rays.origins[:, 2:] / lessons.rays.directions[:, 2:])
+    away = lessons[(x[:, :2].norm(dim=-1) > 0.8).nonzero()[:, 0]]
+    assert len(away) > 1000 and found(away) == ()
+    assert found(lessons[:50]) == ()
+
+
+def test_half_of_the_ground_may_be_out_of_sight() -> None:
+    """Texels far from all that a photo shows are those of the old field in the light beside them, not some mean."""
+    now = Lit(AFTER)
+    lessons = photos(now, [0.4, 2.2])
+    x = lessons.rays.origins + lessons.rays.directions * (-lessons.rays.origins[:, 2:] / lessons.rays.directions[:, 2:])
+    (plane,) = found(lessons[(x[:, 1] > 0).nonzero()[:, 0]])
+    hidden = (plane.nodes[:, 1] < -0.3).reshape(plane.known.shape) & plane.known
+    assert hidden.sum() > 300
+    assert seen(replace(plane, known=hidden), now)[0] > 24
+
+
+def test_places_far_apart_have_textures_of_their_own() -> None:
+    far = grid_of(Ball(at(0.9, 0.9, 0.1), 0.1))
+    cut = UpdatedField(BallWorld((OLD,)), CHANGE)
+    dark = replace(cut.sampler, grid=torch.zeros_like(cut.sampler.grid))
+    around = Region((CHANGE.objects[0].grid.dilated(1.5), far.dilated(1.5)))
+    ground = footholds([CHANGE.objects[0].grid], [LEVEL])
+    planes = textured_planes(ground, around, cut, dark, NOWHERE, photos(AFTER, [0.4]), PIXEL)
+    assert len(planes) == 2 and all(seen(p, AFTER, 3.0)[0] > 33 for p in planes)

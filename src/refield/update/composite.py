@@ -71,7 +71,7 @@ class Earlier:
 
 
 NOTHING_EARLIER = Earlier()
-_DEPTH = 10.0  # optical depth of a sample that meets a textured plane
+_DEPTH = 10.0  # optical depth of a sample of what changed that lies in a textured plane
 _SOLID = 0.05  # opacity of a sample that was not empty before
 _LAYER = 10  # nodes of a grid that make a layer
 _NODES = 500  # of a grid, that are asked instead of all
@@ -286,7 +286,7 @@ class UpdatedField:
             mine = free & ~textured & plane.contains(x[near])
             planes.append((plane, near[mine]))
             textured |= mine
-        helped = free & ~textured & Region(self.region.grids).contains(x[near])
+        helped = free & ~textured & self.region.contains(x[near])
         grounded = (mover < 0) & ~textured & ~helped & self.earlier.places.contains(x[near])
         at, along = looked_up(x[near], d[near], mover, [m.old_from_new for m in self.moves])
         sourced = []
@@ -334,7 +334,7 @@ class UpdatedField:
 
     def _vacated(self, x: Tensor) -> Tensor:
         """Whether world points (S, 3) are around where something left, now or at an earlier visit, (S,) bool."""
-        return Region(self.region.grids).contains(x) | self.earlier.places.contains(x)
+        return self.region.contains(x) | self.earlier.places.contains(x)
 
     def _up_of(self, move: Move, shell: Move) -> Tensor | None:
         """(3,) world: a sample's length away from what a moved object stands on now; None if on nothing.

@@ -14,7 +14,8 @@ class UpdateConfig:
     with the carved object known to be empty and the light set right the old field knows the surroundings better."""
     ground: float = 2.0
     """The ground that objects stood on gets the texture that the new photos show, within each object's grid at its old
-    and its new place, its box this many times as large (§10.1.3: 2 to 3)."""
+    and its new place, its box this many times as large (§10.1.3: 2 to 3). When the object moves on, what lies within
+    `composite.DILATION` times its box is forgotten."""
     shadow: float = 0.01
     """Old photos: pixels this near to an object's mask, in image widths, may hold its shadow (§10.1.3)."""
     far: float = 0.15

@@ -25,8 +25,11 @@ from torch.nn import functional
 
 from refield.field.radiance import Field
 from refield.field.render import CHUNK, render_many, visible_samples
+from refield.field.sampling import OccupancySampler
 from refield.field.volrend import weights
+from refield.field.warp import outline
 from refield.scene.capture import Rays
+from refield.scene.change import OccupancyGrid
 from refield.scene.planes import Plane
 from refield.update.composite import UpdatedField
 from refield.update.ground import Foothold
@@ -46,6 +49,7 @@ _FEWEST = 100  # pixels
 _SOME = 6  # of a photo's pixels, whose mean says how a place looks in it
 _DISPUTED = 0.12  # of a colour channel in [0, 1]; so different a place may not look in two photos
 _ROUNDS = 6  # of texture, trust and plane
+_ROUGH, _FINE = 1e-3, 1e-4  # of what the equations miss at first; texels that no photo shows hardly count in it
 _OFF = 0.5  # samples of the old field; so far off a plane may well be
 _SPREAD = 3.0  # typical errors; as wrong as this is half trusted
 _ERROR = (0.03, 0.05)  # what a typical error is at least and at most, of an RGB colour in [0, 1]
@@ -54,19 +58,40 @@ _GRAZING = 0.1  # sine of the angle at which a ray is taken to meet a plane at l
 
 
 def textured_planes(
-    ground: Sequence[Foothold], around: Region, cut: UpdatedField, unsure: Region, new: Lessons, pixel: float
+    ground: Sequence[Foothold],
+    around: Region,
+    cut: UpdatedField,
+    dark: OccupancySampler,
+    unsure: Region,
+    new: Lessons,
+    pixel: float,
 ) -> tuple[TexturedPlane, ...]:
     """The planes of ``ground`` with what the photos show of them, in the region ``around``.
 
     Args:
         cut: the field before, without what left and with what moved.
+        dark: looks where no old photo did; what the field before shows there, inside of things, is no ground.
         unsure: where something stands now; what a ray through it shows is not the ground.
         new: pixels of the new photos.
         pixel: side of a new photo's pixel there, world units.
     """
     planes = {id(f.plane): f.plane for f in ground}.values()
-    found = [_textured([f for f in ground if f.plane is p], p, around, cut, unsure, new, pixel) for p in planes]
+    found = [
+        _textured([f for f in ground if f.plane is p], p, place, cut, dark, unsure, new, pixel)
+        for p in planes
+        for place in _apart(around)
+    ]
     return tuple(t for t in found if t is not None)
+
+
+def _apart(region: Region) -> list[Region]:
+    """Parts of a region that have nothing to do with each other: what moved far away needs no texels in between."""
+    parts: list[tuple[OccupancyGrid, ...]] = []
+    for grid in region.grids:
+        box = outline(grid)
+        near = [p for p in parts if any(bool(((box[0] < b[1]) & (b[0] < box[1])).all()) for b in Region(p).boxes)]
+        parts = [p for p in parts if p not in near] + [(*(g for p in near for g in p), grid)]
+    return [Region(p) for p in parts]
 
 
 def _textured(
@@ -74,6 +99,7 @@ def _textured(
     plane: Plane,
     around: Region,
     cut: UpdatedField,
+    dark: OccupancySampler,
     unsure: Region,
     new: Lessons,
     pixel: float,
@@ -86,6 +112,7 @@ def _textured(
     for foothold in ground:
         under |= foothold.holds(nodes)
     on, guide = _shown(cut.pretrained, blank, nodes)
+    on &= ~dark.occupied(nodes + blank.clear * blank.normal)
     inside, under, beside = (m.reshape(shape) for m in (inside, inside & under, inside & on & ~under))
     seen = new[replace(blank, known=inside).hit(new.rays).nonzero()[:, 0]]
     t = blank.met(seen.rays)
@@ -201,18 +228,20 @@ def _fitted(plane: TexturedPlane, rays: Rays, colours: Array, guide: _Guide) -> 
     """The plane that shows colours (N, 3) best to rays that come to it, and where these do, (N, 2) texels.
 
     Least squares, reweighted as for Cauchy's errors, for the texture, and in turns with it a Gauss-Newton step for how
-    far the plane is off: its height and its two tilts. One photo says nothing about that, and it stays.
+    far the plane is off: its height and its two tilts. Several photos say that, and a little the old field's texture.
     """
     shape = tuple(plane.known.shape)
     first = plane.texels(rays.origins + plane.met(rays)[:, None] * rays.directions).double().numpy()
     slide = (rays.directions @ plane.axes.T / (rays.directions @ plane.normal)[:, None]).double().numpy()
     levers = np.concatenate([np.ones((len(first), 1)), first / max(shape) - 0.5], 1)
     off, places, trust = np.zeros(3), first, np.ones(len(first))  # off: height in the middle and at the sides, texels
-    mean, texture = colours.mean(0), np.zeros((shape[0] * shape[1], 3))
+    mean = colours.mean(0)
+    texture = np.where(guide.known.reshape(-1, 1), guide.rgb - mean, 0.0)
     smooth, wanted = _smoothness(guide)
     for k in range(_ROUNDS):
         rows = _bilinear(places, shape)
-        texture = _solved(rows, colours - mean, trust, (smooth, wanted), texture)
+        exact = _FINE if k == _ROUNDS - 1 else _ROUGH
+        texture = _solved(rows, colours - mean, trust, (smooth, wanted), texture, exact)
         error = rows @ texture + mean - colours
         size = np.linalg.norm(error, axis=1)
         typical = float(np.clip(np.median(size), *_ERROR))
@@ -225,6 +254,8 @@ def _fitted(plane: TexturedPlane, rays: Rays, colours: Array, guide: _Guide) -> 
             pull = (lever * np.repeat(trust, 3)[:, None]).T
             stay = (typical * plane.texel / (_OFF * plane.clear)) ** 2
             off = off - np.linalg.solve(pull @ lever + stay * np.eye(3), pull @ error.reshape(-1) + stay * off)
+            corner = plane.texel * (abs(off[0]) + abs(off[1]) / 2 + abs(off[2]) / 2)
+            off *= min(1.0, plane.clear / max(corner, 1e-12))  # on plain ground anything fits
             places = first + slide * (levers @ off)[:, None]
     picture = torch.from_numpy((texture + mean).reshape(*shape, 3)).float().clamp(0, 1)
     return replace(_raised(plane, off), rgb=picture), places
@@ -233,7 +264,7 @@ def _fitted(plane: TexturedPlane, rays: Rays, colours: Array, guide: _Guide) -> 
 def _raised(plane: TexturedPlane, off: Array) -> TexturedPlane:
     """A plane higher by off[0] texels in its middle; off[1] and off[2]: from a side to the one opposite."""
     tilt = torch.from_numpy(off[1:]).float() / max(plane.known.shape)
-    axes = plane.axes + tilt[:, None] * plane.normal  # longer by a millionth
+    axes = plane.axes + tilt[:, None] * plane.normal  # longer by half of the tilt's square, which is nothing
     normal = functional.normalize(torch.linalg.cross(axes[0], axes[1]), dim=0)
     up = plane.texel * float(off[0] - off[1:].sum() / 2)
     return replace(plane, origin=plane.origin + up * plane.normal, axes=axes, normal=normal)
@@ -260,12 +291,14 @@ def _smoothness(guide: _Guide) -> tuple[Any, Array]:
     return _SMOOTH**2 * (gradient.T @ gradient), _SMOOTH**2 * wanted
 
 
-def _solved(rows: Any, colours: Array, trust: Array, smoothness: tuple[Any, Array], start: Array) -> Array:
-    """The texture (U * V, 3) that shows colours (N, 3), each trusted so far (N,), from ``start``."""
+def _solved(
+    rows: Any, colours: Array, trust: Array, smoothness: tuple[Any, Array], start: Array, exact: float
+) -> Array:
+    """The texture (U * V, 3) that shows colours (N, 3), each trusted so far (N,), from ``start``; as exact as asked."""
     smooth, wanted = smoothness
     weighted = rows.multiply(trust[:, None]).tocsr()
     system = (rows.T @ weighted + smooth).tocsr()
     diagonal = sparse.diags_array(1 / system.diagonal())
     told = weighted.T @ colours + wanted
-    found = [cg(system, told[:, c], x0=start[:, c], M=diagonal, rtol=1e-3, maxiter=150)[0] for c in range(3)]
+    found = [cg(system, told[:, c], x0=start[:, c], M=diagonal, rtol=exact, maxiter=1000)[0] for c in range(3)]
     return np.stack(found, 1)

@@ -41,13 +41,11 @@ class Region:
         return torch.stack([boxes[:, 0].amin(0), boxes[:, 1].amax(0)])
 
     def contains(self, x: Tensor) -> Tensor:
-        """World points (..., 3) -> (...,) bool."""
+        """Whether world points (..., 3) are in its grids, (...,) bool."""
         flat = x.detach().reshape(-1, 3)
         found = torch.zeros(len(flat), dtype=torch.bool, device=x.device)
         for grid in self.grids:
             found |= grid.contains(flat)
-        for plane in self.planes:
-            found |= plane.contains(flat)
         return found.reshape(x.shape[:-1])
 
     def sampler(self, step: float) -> OccupancySampler:
@@ -79,13 +77,13 @@ def forgotten(planes: Sequence[TexturedPlane], places: Region, but: Region) -> t
     return tuple(replace(p, known=p.known & ~g) for p, g in zip(planes, gone) if (p.known & ~g).any())
 
 
-def above(sampler: OccupancySampler, planes: Sequence[TexturedPlane]) -> OccupancySampler:
-    """A sampler that looks where another does, but not into cells in or beneath planes whose texture is known."""
+def without_planes(sampler: OccupancySampler, planes: Sequence[TexturedPlane]) -> OccupancySampler:
+    """A sampler that looks where another does, but not into cells of planes whose texture is known."""
     grid = sampler.grid.clone()
     for plane in planes:
         cells = grid.view(-1).nonzero()[:, 0]
         x = sampler.points_in(cells, jitter=False)
-        grid.view(-1)[cells[(plane.height(x) <= plane.clear) & plane.over(plane.known, x)]] = 0
+        grid.view(-1)[cells[plane.contains(x)]] = 0
     return replace(sampler, grid=grid)
 
 

@@ -28,7 +28,7 @@ class TexturedPlane:
     origin: Tensor
     """(3,) float32 world: the centre of texel (0, 0)"""
     axes: Tensor
-    """(2, 3) float32 unit, along U and V"""
+    """(2, 3) float32 unit, in the plane, along U and V"""
     texel: float
     """world units"""
     depth: float

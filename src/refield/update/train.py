@@ -29,10 +29,10 @@ from refield.update.ground import Foothold, footholds, planes_around
 from refield.update.helper import new_helper, step_near
 from refield.update.light import Relighting, Sightings, fit_light
 from refield.update.recall import earlier_of
-from refield.update.region import Region, above, finer, meets, move_out
+from refield.update.region import Region, finer, meets, move_out, without_planes
 from refield.update.supervision import Lessons, changed_pixels, new_lessons, old_ring, places_of
 from refield.update.textured import TexturedPlane
-from refield.update.unseen import sight_of
+from refield.update.unseen import Sight, sight_of
 
 DEFAULTS = UpdateConfig()
 _PATCHES, _SHADING_CELLS = 8, 24  # an object's side in patches that are left out together; in cells
@@ -99,14 +99,14 @@ def update_field(
     old = _old_lessons(capture, cut, near, config, light) if cut.to_learn.objects else known.sparse[:0]
     ground = _ground(known, old, wide, eyes, max(_pixel(change, middle), step))
     rows = _some(meets(near, known.sparse.rays).nonzero()[:, 0], _NEW_RAYS)
-    held = _held_out(rows, config.held_out)
+    held = _held_out(len(known.sparse), config.held_out)[rows]
     sparse = known.sparse[rows]
     if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
         return cut
-    planes = _textured(known, ground, config, _pixel(change, middle))
-    say("freeze")
-    told, region = Region(wide.grids, planes), finer(above(near, planes))
     sight = sight_of(cut.pretrained, capture.train, _beside(wide))
+    planes = _textured(known, ground, sight, config, _pixel(change, middle))
+    say("freeze")
+    told, region = Region(wide.grids, planes), finer(without_planes(near, planes))
     frozen = lit(region=told).unshown(sight.hidden)
     if not region.grid.any():
         frozen.why_stopped = "there is nothing but the ground to show"
@@ -160,22 +160,25 @@ def _fixed(frozen: UpdatedField, region: OccupancySampler, rays: Rays, ground: S
     """What is fixed along rays. Nothing beyond the ground that an object stood on: nobody has ever looked through it,
     and where the old field's inside shows as through a mist, a helper needs not become solid."""
     fixed = composite_once(frozen, region, rays)
-    textured = torch.zeros(len(rays), dtype=torch.bool)
+    met = torch.full(
+        (len(rays),), torch.inf
+    )  # a plane whose texture is known hides what lies beyond it, and is to stay
     for plane in frozen.region.planes:
-        textured |= plane.hit(rays)
+        met = torch.where(plane.hit(rays), torch.minimum(met, plane.met(rays) - plane.depth), met)
     for foothold in ground:
-        fixed = fixed.before(torch.where(textured, torch.inf, foothold.entered(rays)))
+        entered = foothold.entered(rays)
+        fixed = fixed.before(torch.where(met < entered, torch.inf, entered))
     return fixed
 
 
-def _held_out(rows: Tensor, every: int) -> Tensor:
-    """Which pixels of the new photos, rows (K,) of all of them, are kept to judge by, (K,) bool."""
-    every = max(every, 2)  # something has to be left to learn from
-    return rows % every == every // 2
+def _held_out(count: int, every: int) -> Tensor:
+    """Which of the new photos' pixels are kept to judge by, (count,) bool: one of ``every``, always the same ones."""
+    drawn = torch.rand(count, generator=torch.Generator().manual_seed(0))
+    return drawn * max(every, 2) < 1  # something has to be left to learn from
 
 
 def _textured(
-    known: _Known, ground: Sequence[Foothold], config: UpdateConfig, pixel: float
+    known: _Known, ground: Sequence[Foothold], sight: Sight, config: UpdateConfig, pixel: float
 ) -> tuple[TexturedPlane, ...]:
     """The texture of the ground that objects stood on, and of what is beside these places and the new ones."""
     if not ground:
@@ -184,8 +187,8 @@ def _textured(
     places = [o.grid for o in cut.to_learn.objects] + [m.grid.moved(m.new_from_old) for m in cut.moves]
     around = Region(tuple(g.dilated(config.ground) for g in places) + cut.earlier.unknown.grids)
     arrived = tuple(g for o in cut.change.objects if (g := o.grid_now) is not None)
-    taught = sparse[(~_held_out(torch.arange(len(sparse)), config.held_out)).nonzero()[:, 0]]
-    return textured_planes(ground, around, cut, Region(arrived + cut.bare.grids), taught, pixel)
+    taught = sparse[(~_held_out(len(sparse), config.held_out)).nonzero()[:, 0]]
+    return textured_planes(ground, around, cut, sight.dark, Region(arrived + cut.bare.grids), taught, pixel)
 
 
 def _in_reach(region: OccupancySampler, frames: tuple[Frame, ...]) -> OccupancySampler:
