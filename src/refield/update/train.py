@@ -160,9 +160,7 @@ def _fixed(frozen: UpdatedField, region: OccupancySampler, rays: Rays, ground: S
     """What is fixed along rays. Nothing beyond the ground that an object stood on: nobody has ever looked through it,
     and where the old field's inside shows as through a mist, a helper needs not become solid."""
     fixed = composite_once(frozen, region, rays)
-    met = torch.full(
-        (len(rays),), torch.inf
-    )  # a plane whose texture is known hides what lies beyond it, and is to stay
+    met = torch.full((len(rays),), torch.inf)  # where a textured plane hides what is beyond it, and has to stay
     for plane in frozen.region.planes:
         met = torch.where(plane.hit(rays), torch.minimum(met, plane.met(rays) - plane.depth), met)
     for foothold in ground:
