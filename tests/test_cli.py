@@ -139,7 +139,6 @@ def test_nothing_changed_writes_only_the_report(place, monkeypatch, capsys):
 
 
 def test_updates_stack(place, monkeypatch, capsys):
-    monkeypatch.setattr(update, "MOST_LOST", 100.0)  # so short a fit knows nothing
     believing(monkeypatch, "removed")
     assert main(["update", "work", "new", *FEW]) == 0
     assert "1 object changed: 1 removed" in capsys.readouterr().out
@@ -173,7 +172,6 @@ def test_the_other_architecture_all_the_way(place, monkeypatch, capsys):
     few += ["--nerfacto.steps", "5", "--nerfacto.rays", "64"]
     assert main(["train", "data", "other", "--architecture", "nerfacto", *few]) == 0
     assert json.loads((place / "other/field/field.json").read_text())["architecture"] == "NerfactoField"
-    monkeypatch.setattr(update, "MOST_LOST", 100.0)
     believing(monkeypatch, "moved")
     assert main(["update", "other", "new", *FEW]) == 0
     assert main(["render", "other", "--cameras", "new/transforms.json", "--out", "pictures"]) == 0
@@ -181,7 +179,6 @@ def test_the_other_architecture_all_the_way(place, monkeypatch, capsys):
 
 
 def test_visits_are_listed_and_taken_back(place, monkeypatch, capsys):
-    monkeypatch.setattr(update, "MOST_LOST", 100.0)
     assert main(["visits", "work"]) == 0
     assert "no visit" in capsys.readouterr().out
     assert main(["undo", "work"]) == 2
@@ -204,16 +201,6 @@ def test_visits_are_listed_and_taken_back(place, monkeypatch, capsys):
     assert main(["undo", "work"]) == 0 and contents(place / "work") == first
     assert main(["undo", "work"]) == 0 and contents(place / "work") == before
     assert "after visit 0" in capsys.readouterr().out
-
-
-def test_an_update_that_does_harm_is_not_kept(place, monkeypatch, capsys):
-    believing(monkeypatch, "removed")
-    values = iter((30.0, 28.0))
-    monkeypatch.setattr(update, "untouched_psnr", lambda *a: next(values))
-    before = contents(place / "work")
-    assert main(["update", "work", "new", *FEW]) == 2
-    assert "2.0 dB worse and is not kept" in capsys.readouterr().err
-    assert contents(place / "work") == before
 
 
 def test_no_usable_photo(place, monkeypatch, capsys):
@@ -316,7 +303,6 @@ def killed(*args):
     os.kill(os.getpid(), signal.SIGKILL)
 
 setattr(home, name, killed)
-update.MOST_LOST = 100.0
 believing(pytest.MonkeyPatch(), "removed")
 main(["update", "work", "new", *FEW])
 """
@@ -343,7 +329,6 @@ def test_a_killed_update_leaves_the_workspace_as_it_was_or_complete(place, monke
         assert contents(place / "work") == before
     else:
         assert visible == before
-    monkeypatch.setattr(update, "MOST_LOST", 100.0)
     believing(monkeypatch, "removed")
     assert main(["update", "work", "new", *FEW]) == 0  # and clears away what the killed one left
     assert not list(place.glob("work/**/.part-*"))

@@ -5,9 +5,9 @@ import torch
 
 from refield.estimate.look import view_of
 from refield.field.render import render_camera
-from refield.history import known_objects, retouched, untouched_psnr
+from refield.history import known_objects, retouched
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
-from refield.scene.images import frame_image, scaled_image
+from refield.scene.images import frame_image
 from refield.update.composite import UpdatedField
 from refield.update.light import Relighting
 from refield.update.region import Region
@@ -60,22 +60,6 @@ def test_what_moved_is_known_where_it_is_now():
     assert torch.allclose(known.grid.tight_aabb().mean(0), torch.tensor([1.0, 0.0, 0.0]), atol=0.05)
     gone = UpdatedField(now, SceneChange((ObjectChange("removed", known.grid),)))
     assert known_objects(gone) == []
-
-
-def test_a_picture_may_be_smaller_than_its_photo(tmp_path):
-    """What a mask touches is left out, also where a smaller picture's pixel holds but one of its pixels."""
-    frames = write_capture(tmp_path / "data", 2).frames
-    camera = frames[0].camera
-    half = camera.scaled(camera.width // 2, camera.height // 2)
-    masks = [torch.zeros(camera.height, camera.width, dtype=torch.bool) for _ in frames]
-    for mask in masks:
-        mask[: camera.height // 2 + 1] = True
-    for seen in (camera, half):
-        pictures = [scaled_image(f, seen) for f in frames]
-        for picture in pictures:
-            picture[: seen.height // 2 + 1] += 0.5
-            picture[seen.height // 2 + 1 :] += 0.1
-        assert abs(untouched_psnr(pictures, frames, masks) - 20) < 1e-3
 
 
 def test_photos_are_out_of_date_where_only_the_light_changed(tmp_path):

@@ -5,8 +5,6 @@ Every visit that changed something wraps the field before it; an updated field i
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -130,18 +128,3 @@ def _differs(was: Tensor, now: Tensor) -> Tensor:
     """(H, W) float32, 1 where two pictures (H, W, 3) look different, with a margin of a pixel."""
     mask = ((was - now).abs().amax(-1) > _SHOWS).float()
     return functional.max_pool2d(mask[None, None], 3, stride=1, padding=1)[0, 0]
-
-
-def untouched_psnr(shown: Sequence[Tensor], frames: Sequence[Frame], masks: Sequence[Tensor]) -> float:
-    """PSNR (dB) of pictures over the pixels of ``frames`` that are in no mask, all frames pooled.
-
-    Pictures are (H, W, 3), of the photos' own sizes or smaller; masks (h, w) bool, of the photos' own.
-    """
-    error, count = 0.0, 0
-    for picture, frame, mask in zip(shown, frames, masks):
-        size = picture.shape[:2]
-        same = functional.adaptive_max_pool2d(mask[None].float(), size)[0] == 0
-        truth = scaled_image(frame, frame.camera.scaled(size[1], size[0]))
-        error += float((picture[same] - truth[same]).square().sum())
-        count += 3 * int(same.sum())
-    return -10 * math.log10(max(error / max(count, 1), 1e-12))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +19,7 @@ from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.evaluate import Report, evaluate
 from refield.field.radiance import Field
 from refield.field.render import render_camera
-from refield.history import known_objects, retouched, state, untouched_psnr
+from refield.history import known_objects, retouched, state
 from refield.photos.taken import PhotoConfig
 from refield.report import summary, write_report
 from refield.scene.capture import Capture
@@ -33,9 +33,7 @@ from refield.update.train import update_field
 from refield.workspace import Workspace
 
 SHOWN = 256 * 256
-"""pixels, about and at most, of what a field shows of a new photo; an update is judged by it, and the page shows it"""
-MOST_LOST = 0.2
-"""dB that the unchanged pixels of the new photos may lose before an update is refused"""
+"""pixels, about and at most, of what a field shows of a new photo on the page"""
 
 
 @dataclass(frozen=True)
@@ -83,7 +81,7 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
     """Estimate, update, judge, report: one visit, published whole or not at all.
 
     Raises:
-        InputError: no workspace, unusable photos, or an update that would make the field worse.
+        InputError: no workspace, or unusable photos.
     """
     workspace = Workspace.open(options.work)
     models = options.estimate.models.open()
@@ -107,11 +105,10 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         ).among(placed)
         _need_a_photo(options.photos, change)
         new = _updated(capture, old, change, options.update, clock)
-        clock.stage("judge the update" if new else "report")
+        clock.stage("report")
         before, after = _shown(old, change), None if new is None else _shown(new, change)
-        if after is not None:
-            _need_no_harm(change, before, after)
-            clock.stage("report")
+        for part in () if new is None else new.left_out:
+            clock.warn(f"left out of the update: {part}")
         evaluation = None
         if options.evaluation is not None:
             evaluation = evaluate(new or old, options.evaluation, old=old if new else None)
@@ -145,16 +142,3 @@ def _updated(
 def _shown(field: Field, change: SceneChange) -> list[Tensor]:
     """What a field shows from where each used new photo was taken, (H, W, 3) each, of about `SHOWN` pixels at most."""
     return [render_camera(field, f.camera.within(SHOWN), f.world_from_cam).rgb for f in change.frames]
-
-
-def _need_no_harm(change: SceneChange, before: Sequence[Tensor], after: Sequence[Tensor]) -> None:
-    """Refuse an update that shows the unchanged pixels of the new photos worse than the old field does.
-
-    Raises:
-        InputError: it does.
-    """
-    masks = [a | b for a, b in zip(change.masks_in, change.masks_out)]
-    was, now = (untouched_psnr(shown, change.frames, masks) for shown in (before, after))
-    if now < was - MOST_LOST:
-        what = f"the update would make unchanged pixels {was - now:.1f} dB worse and is not kept"
-        raise InputError("update", what, "check the new photos' poses and light, or give more photos")

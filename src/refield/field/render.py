@@ -30,14 +30,31 @@ def render_rays(field: Field, rays: Rays, jitter: bool = False) -> Rendering:
 
 
 def render_many(field: Field, rays: Rays, chunk: int = CHUNK) -> Rendering:
-    """:func:`render_rays` without gradients, chunk by chunk."""
+    """:func:`render_rays` without gradients, chunk by chunk. Rays that meet nothing of what a field changed in another
+    (``unchanged``) are that other's."""
     with torch.no_grad():
-        parts = [render_rays(field, rays[i : i + chunk]) for i in range(0, max(len(rays), 1), chunk)]
+        parts = [_rendered(field, rays[i : i + chunk]) for i in range(0, max(len(rays), 1), chunk)]
     return Rendering(
         torch.cat([p.rgb for p in parts]),
         torch.cat([p.depth for p in parts]),
         torch.cat([p.opacity for p in parts]),
     )
+
+
+def _rendered(field: Field, rays: Rays) -> Rendering:
+    """Of one chunk."""
+    unchanged: Callable[[Rays], tuple[Field, Tensor]] | None = getattr(field, "unchanged", None)
+    if unchanged is None:
+        return render_rays(field, rays)
+    before, same = unchanged(rays)
+    rows, rest = same.nonzero()[:, 0], (~same).nonzero()[:, 0]
+    if len(rest) == 0:
+        return _rendered(before, rays)
+    if len(rows) == 0:
+        return render_rays(field, rays)
+    old, new = _rendered(before, rays[rows]), render_rays(field, rays[rest])
+    order = torch.cat([rows, rest]).argsort()
+    return Rendering(*(torch.cat([getattr(p, k) for p in (old, new)])[order] for k in ("rgb", "depth", "opacity")))
 
 
 def render_camera(field: Field, camera: Camera, world_from_cam: Tensor, chunk: int = CHUNK) -> Rendering:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -115,6 +116,8 @@ class UpdatedField:
         self.shading, self.eyes, self.bare = shading, eyes, bare
         self.why_stopped = ""
         """what ended the helper's training, in words; empty if it was not trained here"""
+        self.left_out: tuple[str, ...] = ()
+        """parts of the update that showed unchanged pixels worse and are not in it, in words"""
         if region is None:
             rest = self.to_learn
             region = carved(rest, SKIN * pretrained.sampler.step) if helper is None else move_out(rest, DILATION)
@@ -132,17 +135,20 @@ class UpdatedField:
         self.boxes = tuple(m.box_now for m in self._shells) + region.boxes + earlier.places.boxes
         self._opaque = _DEPTH / finer(pretrained.sampler).step  # density of a plane whose texture is known
         self._base: HashField | NerfactoField | None = _base_of(pretrained)
-        self._told, self._nothing = self._told_cells(pretrained.sampler)
+        self._own, self._nothing = self._told_cells(pretrained.sampler)
+        earlier_told = pretrained._told if isinstance(pretrained, UpdatedField) else self._own
+        self._told: Tensor = self._own | earlier_told
+        """(R, R, R) uint8: cells whose centre is answered for by a move, a helper or nobody, at this visit or before"""
         none = pretrained.sampler.grid.new_zeros(0, dtype=torch.long)
         self.unseen: Tensor = pretrained.unseen if isinstance(pretrained, UpdatedField) else none
         """flat indices of the sampler's cells that are not shown, see `unshown`"""
         if sampler is None:
             sampler = self._without_unseen(pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES))
         self.sampler = sampler
-        # a cell whose centre is just outside may hold a corner that is inside
-        self._retold = functional.max_pool3d(self._told[None, None].float(), 3, 1, 1)[0, 0].to(torch.uint8)
+        self._retold = _widened(self._told)
         before = pretrained._marched if isinstance(pretrained, UpdatedField) else ()
         self._split_of: tuple[Tensor, tuple[OccupancySampler, OccupancySampler]] | None = None
+        self._changed_of: tuple[Tensor, tuple[OccupancySampler, tuple[Tensor, ...]]] | None = None
         self._marched: tuple[Tensor, ...] = tuple(_by_cells(self.sampler, b) for b in self.boxes) + before
 
     @property
@@ -156,6 +162,23 @@ class UpdatedField:
         out = copy(self)
         out.unseen = torch.cat([self.unseen, cells]).unique()
         out.sampler = out._without_unseen(self.sampler)
+        return out
+
+    def but(self, **parts: Any) -> UpdatedField:
+        """The same update with other ``region``, ``light`` or ``shading``, as of the constructor."""
+        kept = {"region": self.region, "light": self.light, "shading": self.shading} | parts
+        out = UpdatedField(
+            self.pretrained,
+            self.change,
+            self.helper,
+            **kept,
+            eyes=self.eyes,
+            bare=self.bare,
+            earlier=self.earlier,
+            skipped=self.skipped,
+            untaught=self.untaught,
+        ).unshown(self.unseen)
+        out.why_stopped = self.why_stopped
         return out
 
     def _without_unseen(self, sampler: OccupancySampler) -> OccupancySampler:
@@ -191,6 +214,36 @@ class UpdatedField:
         grid.view(-1)[self.unseen] = 1 - self._told.view(-1)[self.unseen]
         return replace(self.sampler, grid=grid)
 
+    def unchanged(self, rays: Rays) -> tuple[Field, Tensor]:
+        """The field before, and which of N rays show what it shows, (N,) bool: they meet no cell in which this visit
+        says anything, be it that nothing is there or that the light is another."""
+        cells, boxes = self._changed
+        same = torch.ones(len(rays), dtype=torch.bool, device=rays.origins.device)
+        if boxes:
+            exits = torch.stack([leaving(rays, box) for box in boxes]).amax(0)
+            near = (exits > 0).nonzero()[:, 0]
+            if len(near):
+                far = float(exits.max()) / cells.contraction.radius
+                same[near] = replace(cells, far=min(far, cells.far))(rays[near]).ray_offsets.diff() == 0
+        return self.pretrained, same
+
+    @property
+    def _changed(self) -> tuple[OccupancySampler, tuple[Tensor, ...]]:
+        """Looks into the cells in which this visit says anything; and world boxes (2, 3) that hold them all. Kept,
+        since marching remembers a grid."""
+        if self._changed_of is None or self._changed_of[0] is not self.sampler.grid:
+            grid = _widened(self._own) | (self.sampler.grid != self.pretrained.sampler.grid).to(torch.uint8)
+            boxes = list(self.boxes)
+            if self.light is not None:
+                grid |= self.light.cells(self.sampler)
+                boxes.append(self.light.aabb)
+            if len(self.unseen):
+                x = self.sampler.points_in(self.unseen, jitter=False)
+                boxes.append(torch.stack([x.amin(0), x.amax(0)]))
+            cells = finer(replace(self.sampler, grid=grid))
+            self._changed_of = self.sampler.grid, (cells, tuple(_by_cells(self.sampler, b) for b in boxes))
+        return self._changed_of[1]
+
     @property
     def _split(self) -> tuple[OccupancySampler, OccupancySampler]:
         """The sampler of what never changed and that of the rest, which is finer; kept, since marching remembers a
@@ -212,11 +265,10 @@ class UpdatedField:
         return Samples(found.t_starts, found.t_ends, torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
 
     def _told_cells(self, sampler: OccupancySampler) -> tuple[Tensor, Tensor]:
-        """(R, R, R) uint8: cells whose centre is answered for by a move, a helper or nobody, at this visit or an
-        earlier one. And those (flat indices) in which the state that knows an earlier place shows nothing."""
+        """(R, R, R) uint8: cells whose centre is answered for by a move, a helper or nobody, at this visit. And those
+        (flat indices) in which the state that knows an earlier place shows nothing."""
         empty = [sampler.grid.new_zeros(0, dtype=torch.long)]
-        earlier = self.pretrained._told if isinstance(self.pretrained, UpdatedField) else None
-        grid = torch.zeros_like(sampler.grid) if earlier is None else earlier.clone()
+        grid = torch.zeros_like(sampler.grid)
         for box in self.boxes:
             cells = sampler.cells_in(box)
             x = sampler.points_in(cells, jitter=False)
@@ -454,6 +506,11 @@ def _base_of(field: Field) -> HashField | NerfactoField | None:
     if isinstance(field, UpdatedField):
         return field._base
     return field if isinstance(field, HashField | NerfactoField) else None
+
+
+def _widened(cells: Tensor) -> Tensor:
+    """Cells (R, R, R) uint8 and those beside them: one whose centre is outside may hold a corner that is inside."""
+    return functional.max_pool3d(cells[None, None].float(), 3, 1, 1)[0, 0].to(torch.uint8)
 
 
 def _by_cells(sampler: OccupancySampler, box: Tensor) -> Tensor:

@@ -89,8 +89,9 @@ def _apart(region: Region) -> list[Region]:
     parts: list[tuple[OccupancyGrid, ...]] = []
     for grid in region.grids:
         box = outline(grid)
-        near = [p for p in parts if any(bool(((box[0] < b[1]) & (b[0] < box[1])).all()) for b in Region(p).boxes)]
-        parts = [p for p in parts if p not in near] + [(*(g for p in near for g in p), grid)]
+        touch = [any(bool(((box[0] < b[1]) & (b[0] < box[1])).all()) for b in Region(p).boxes) for p in parts]
+        joined = [g for p, near in zip(parts, touch) if near for g in p]
+        parts = [p for p, near in zip(parts, touch) if not near] + [(*joined, grid)]
     return [Region(p) for p in parts]
 
 

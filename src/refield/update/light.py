@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from refield.field.kernels.cpu.simd import JIT
+from refield.field.sampling import OccupancySampler
 from refield.field.warp import inside_box
 from refield.scene.inside import cell_along
 
@@ -43,6 +44,20 @@ class Relighting:
         out = functional.grid_sample(volume, at, padding_mode="border", align_corners=True)
         factor = torch.exp(out.reshape(3, -1).T)
         return torch.where(inside_box(x.detach(), self.aabb)[:, None], factor, torch.ones_like(factor))
+
+    def cells(self, sampler: OccupancySampler) -> Tensor:
+        """Cells of a sampler's grid in which some factor is not 1, (R, R, R) uint8, and perhaps some beside them."""
+        out = torch.zeros_like(sampler.grid)
+        lit = (self.log_gain != 0).any(-1)
+        reach = functional.max_pool3d(lit[None, None].float(), 3, 1, 1)[0, 0] > 0  # what is between nodes has of both
+        spacing = (self.aabb[1] - self.aabb[0]) / (torch.tensor(lit.shape) - 1)
+        out.view(-1)[sampler.cells(self.aabb[0] + reach.nonzero() * spacing)] = 1
+        cells = sampler.cells_in(self.aabb)  # which may be narrower than the lattice's
+        node = ((sampler.points_in(cells, jitter=False) - self.aabb[0]) / spacing).round().long()
+        inside = ((node >= 0) & (node < torch.tensor(lit.shape))).all(-1)
+        i, j, k = node[inside].unbind(-1)
+        out.view(-1)[cells[inside]] |= reach[i, j, k].to(out.dtype)
+        return out
 
     def applied(self, x: Tensor, rgb: Tensor) -> Tensor:
         """World points (S, 3), colours (S, 3) -> colours in the new light (S, 3) in [0, 1]."""

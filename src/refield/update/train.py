@@ -30,6 +30,7 @@ from refield.update.helper import new_helper, step_near
 from refield.update.light import Relighting, Sightings, fit_light
 from refield.update.recall import earlier_of
 from refield.update.region import Region, finer, meets, move_out, without_planes
+from refield.update.spared import spared
 from refield.update.supervision import Lessons, changed_pixels, new_lessons, old_ring, places_of
 from refield.update.textured import TexturedPlane
 from refield.update.unseen import Sight, sight_of
@@ -90,7 +91,7 @@ def update_field(
     if not wide.grids:
         updated = lit(region=wide)
         updated.why_stopped = "earlier visits know all of it"
-        return updated
+        return _without_harm(updated, known)
     say("supervise")
     middle = wide.box.mean(0)
     step = step_near(field, middle)
@@ -110,7 +111,7 @@ def update_field(
     frozen = lit(region=told).unshown(sight.hidden)
     if not region.grid.any():
         frozen.why_stopped = "there is nothing but the ground to show"
-        return frozen
+        return _without_harm(frozen, known)
     fixed = _fixed(frozen, region, sparse.rays, ground)
     new_taught, judge = (Lit(sparse[r], fixed[r]) for r in ((~held).nonzero()[:, 0], held.nonzero()[:, 0]))
     old_taught = Lit(old, _fixed(frozen, region, old.rays, ground))
@@ -122,7 +123,14 @@ def update_field(
     helper.requires_grad_(False)
     updated = lit(helper=helper, region=told).unshown(sight.hidden)
     updated.why_stopped = run.why_stopped
-    return updated
+    return _without_harm(updated, known)
+
+
+def _without_harm(updated: UpdatedField, known: _Known) -> UpdatedField:
+    """The update without the parts of it that show unchanged pixels worse."""
+    kept, left_out = spared(updated, known.sparse, known.sparse.within(known.changed))
+    kept.left_out = tuple(f"{o.part} (unchanged pixels beside: {o.gain:.1f} dB better without it)" for o in left_out)
+    return kept
 
 
 @dataclass(frozen=True)
