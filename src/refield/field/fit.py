@@ -85,10 +85,11 @@ class _StuckError(RuntimeError):
     """What the fit has built before the cameras hides the scene, and nothing behind it learns any more."""
 
 
-# Some fits of a scene with a repeating texture, seen from all around, end in foam before the cameras: a few in a hundred,
-# of some captures most. Another seed does not. Foam is photos learnt by heart: those that are left out gain nothing by
-# it. From the first of these steps to the second, left-out photos gained -0.5 to 0.04 of what those that teach did (in
-# dB) in four foamed fits of one world, 0.27 to 0.67 in six sound ones of three real scenes, 0.7 and more in nine others.
+# Some fits of a scene with a repeating texture, seen from all around, end in foam before the cameras: a few in a
+# hundred, of some captures most. Another seed does not. Foam is photos learnt by heart: those that are left out gain
+# nothing by it. From the first of these steps to the second, left-out photos gained -0.5 to 0.04 of what those that
+# teach did (in dB) in four foamed fits of one world, 0.27 to 0.67 in six sound ones of three real scenes, 0.7 and more
+# in nine others.
 _TRIES, _FIRST_STEP, _SECOND_STEP = 5, 100, 500
 _LATE = 0.3  # of its time; so late a fit does not begin anew
 _BY_HEART = 0.1
