@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -125,4 +126,4 @@ def test_a_sequence_is_split_evenly(part) -> None:
     old, new, evaluation = part("trials")._parts(67)
     assert sorted([*old, *new, *evaluation]) == list(range(67))
     assert len(new) == len(evaluation) == 4
-    assert min(b - a for a, b in zip(new, new[1:])) >= 16
+    assert min(b - a for a, b in itertools.pairwise(new)) >= 16

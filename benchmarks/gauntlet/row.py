@@ -25,6 +25,8 @@ from refield.scene.load import is_posed
 from refield.scene.transforms_json import load_transforms, stem
 
 RESULT, STRIP = "row.json", "strip.png"
+BRIGHTER = 3
+"""the factor by which errors are shown"""
 _SCORED = ("psnr", "psnr_in", "psnr_out", "psnr_untouched")
 
 
@@ -143,7 +145,7 @@ def _strip(folder: Path, data: Path) -> None:
     renders = [folder / name / f"{stem(frame)}.png" for name in ("renders_before", "renders")]
     masks, photo = masks_of(data / "eval", frame.name), frame_image(frame).float() / 255
     old, now = (read_image(p).float() / 255 if p.is_file() else None for p in renders)
-    error = None if now is None else (now - photo).abs()
+    error = None if now is None else BRIGHTER * (now - photo).abs()
     out = Image.new("RGB", (4 * (SIDE + GAP), SIDE), "white")
     for i, picture in enumerate((old, photo, now, error)):
         if picture is not None:

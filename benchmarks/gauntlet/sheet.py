@@ -1,4 +1,4 @@
-"""The worst scenes as one picture: old render · photo · render now · absolute error, with what failed."""
+"""The worst scenes as one picture: old render · photo · render now · error, with what failed."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from PIL import Image, ImageDraw, ImageFont
 from record import Row
 from tables.tiles import CAPTION, GAP, SIDE, write_picture
 
-from gauntlet.row import STRIP
+from gauntlet.row import BRIGHTER, STRIP
 from gauntlet.summary import badness, verdict
 
-COLUMNS = ("before", "photo", "now", "absolute error")
+COLUMNS = ("before", "photo", "now", f"absolute error, times {BRIGHTER}")
 WORST = 10
 _INK = (60, 60, 67)
 _LETTER = 7

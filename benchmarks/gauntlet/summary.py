@@ -155,9 +155,8 @@ def wilson(count: int, of: int) -> tuple[float, float]:
 
 def groups_table(rows: Sequence[Row], by: str) -> str | None:
     """The main figures for each value of a fact ("path", "place"), or of the kinds that changed ("change")."""
-    values = {
-        id(r): kinds(r.get("true")) if by == "change" else str(r.get("facts", {}).get(by, "–")) for r in told(rows)
-    }
+    known = told(rows)
+    values = {id(r): kinds(r.get("true")) if by == "change" else str(r.get("facts", {}).get(by, "–")) for r in known}
     names = sorted(set(values.values()))
     if not names or (by != "change" and names == ["–"]):
         return None
