@@ -16,6 +16,7 @@ import argparse
 import os
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,6 +38,7 @@ def main() -> int:
         return 0
     synth, data = tuple(shlex.split(arguments.synth)), arguments.data if arguments.real else None
     trials, skipped = chosen(_seeds(arguments.seeds), arguments.worlds, data, synth)
+    trials = [replace(t, train=tuple(shlex.split(arguments.train))) for t in trials]
     ledger = Ledger(arguments.ledger)
     try:
         if not trials:
@@ -57,6 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--real", action="store_true", help="real photographs")
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="where these are")
     parser.add_argument("--synth", default="", help="further options of `refield synth`, in one string")
+    parser.add_argument("--train", default="", help="and of `refield train`, such as --fit.seed")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "gauntlet", help="rows, logs, tables, sheet")
     parser.add_argument("--jobs", type=int, default=1, help="scenes at once; of several each has one core")
     parser.add_argument("--limit", type=float, default=1200.0, help="seconds for a scene")

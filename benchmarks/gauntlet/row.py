@@ -35,17 +35,17 @@ def run_trial(trial: Trial, folder: Path) -> Row:
     chain = Chain(folder)
     data = make(trial, chain)
     if data is not None:
-        run_commands(chain, data)
+        run_commands(chain, data, trial.train)
     row = scored(folder, data, chain.ran)
     if data is not None:
         _strip(folder, data)
     return row
 
 
-def run_commands(chain: Chain, data: Path) -> None:
+def run_commands(chain: Chain, data: Path, train: Sequence[str] = ()) -> None:
     """Train, update, render both states, evaluate; after an update that failed the others show the old field."""
     work, evaluation = chain.folder / "work", data / "eval"
-    if not chain.run("train", "train", data / "before", work):
+    if not chain.run("train", "train", data / "before", work, *train):
         return
     chain.run("update", "update", work, data / "after")
     if is_posed(evaluation):

@@ -36,6 +36,8 @@ class Trial:
     """the world's name, or the folder of real photographs"""
     synth: tuple[str, ...] = ()
     """further options of ``refield synth``"""
+    train: tuple[str, ...] = ()
+    """and of ``refield train``"""
 
     @property
     def key(self) -> str:
@@ -51,7 +53,7 @@ class Trial:
     @staticmethod
     def from_json(text: str) -> Trial:
         record: dict[str, Any] = json.loads(text)
-        return Trial(**record | {"synth": tuple(record["synth"])})
+        return Trial(**record | {name: tuple(record[name]) for name in ("synth", "train")})
 
 
 def chosen(
@@ -125,7 +127,7 @@ def _seed(trial: Trial) -> tuple[str, ...]:
 def _rehearse(trial: Trial, chain: Chain, out: Path) -> bool:
     """Fit the photographs as they are, and composite a change into them there."""
     base = chain.folder / "base"
-    fitted = chain.run("train base", "train", trial.data, base)
+    fitted = chain.run("train base", "train", trial.data, base, *trial.train)
     return fitted and chain.run("synth", "synth", "random", out, "--into", base, *_seed(trial), *trial.synth)
 
 
