@@ -15,6 +15,8 @@ import torch
 from refield.scene.change import ObjectChange, OccupancyGrid
 from refield.scene.errors import InputError
 from refield.scene.files import read_json
+from refield.scene.transforms_json import load_transforms
+from tests.captures import write_capture
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 
@@ -120,6 +122,22 @@ def test_the_worst_come_first(part) -> None:
         {"failed": None, "right": True, "psnr_in": 30.0},
     ]
     assert sorted(rows[::-1], key=badness, reverse=True) == rows
+
+
+def test_photos_of_one_visit_are_old_and_new_ones(part, tmp_path: Path) -> None:
+    write_capture(tmp_path / "photos", 12)
+    chain, trials = part("chain").Chain(tmp_path), part("trials")
+    trial = trials.Trial("still", "nothing changed", None, str(tmp_path / "photos"))
+    data = trials.make(trial, chain)
+    counts = [len(load_transforms(data / name, decode=False).frames) for name in ("before", "after", "eval")]
+    assert counts == [4, 4, 4] and part("match").true_objects(data) == ()
+
+
+def test_what_is_not_there_is_left_out_with_a_reason(part, tmp_path: Path) -> None:
+    (tmp_path / "plush").mkdir()
+    trials, skipped = part("trials").chosen([7], [], tmp_path)
+    assert [t.source for t in trials] == ["nothing changed", "rehearsal"] and trials[1].seed == 7
+    assert len(skipped) == 5 and all("is not there" in line for line in skipped)
 
 
 def test_a_sequence_is_split_evenly(part) -> None:
