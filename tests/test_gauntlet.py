@@ -64,6 +64,19 @@ def test_pose_errors_are_told_by_distance(part) -> None:
     assert row["off, °"] == pytest.approx(0.0, abs=1e-4)
 
 
+def test_turns_that_cannot_be_seen_are_known(part) -> None:
+    things = [
+        ("ball", "plain", "added"),
+        ("can", "dotted", "moved"),
+        ("box", "plain", "none"),
+        ("cone", "plain", "tipped"),
+    ]
+    facts = {"objects": [{"family": f, "texture": t, "change": c} for f, t, c in things]}
+    symmetric = part("row").symmetric
+    assert symmetric(facts, 3) == {1, 2}  # in the order of the truth: can, cone, and what arrived
+    assert symmetric({}, 3) == symmetric(facts, 2) == set()
+
+
 def test_wilson_interval_is_the_published_one(part) -> None:
     lo, hi = part("summary").wilson(15, 148)  # Newcombe 1998, Table I: 0.0624 to 0.1605
     assert (lo, hi) == (pytest.approx(0.0624, abs=5e-5), pytest.approx(0.1605, abs=5e-5))

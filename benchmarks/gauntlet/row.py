@@ -25,6 +25,7 @@ from refield.scene.load import is_posed
 from refield.scene.transforms_json import load_transforms, stem
 
 RESULT, STRIP = "row.json", "strip.png"
+_ROUND, _PLAIN = ("ball", "can", "pole", "cone"), "plain"
 BRIGHTER = 3
 """the factor by which errors are shown"""
 _SCORED = ("psnr", "psnr_in", "psnr_out", "psnr_untouched")
@@ -90,10 +91,10 @@ def _objects(change: SceneChange | None, true: Sequence[ObjectChange], facts: Ro
     """Kinds told and true, and each true object with what was found of it."""
     found = () if change is None else change.objects
     match = matched(found, true)
-    objects = []
+    objects, unseen = [], symmetric(facts, len(true))
     for k, t in enumerate(true):
         f = found[match.pairs[k]] if k in match.pairs else None
-        one: Row = {"true": t.kind, "told": None if f is None else f.kind, "symmetric": k in _symmetric(facts)}
+        one: Row = {"true": t.kind, "told": None if f is None else f.kind, "symmetric": k in unseen}
         if f is not None and change is not None:
             one |= {"confidence": float(f.confidence)} | pose_row(f, t, centres(change.frames))
         if one["symmetric"]:
@@ -112,10 +113,16 @@ def _objects(change: SceneChange | None, true: Sequence[ObjectChange], facts: Ro
     }
 
 
-def _symmetric(facts: Row) -> set[int]:
-    """Indices of the true objects whose turn cannot be seen."""
-    objects = facts.get("objects", [])
-    return {i for i, o in enumerate(objects) if isinstance(o, dict) and o.get("symmetric")}
+def symmetric(facts: Row, count: int) -> set[int]:
+    """Indices of the ``count`` true objects whose turn cannot be seen: round ones of one colour.
+
+    The facts tell of each thing in the scene; true objects that were there come first, then what arrived.
+    """
+    changed = [o for o in facts.get("objects", []) if o["change"] != "none"]
+    changed.sort(key=lambda o: o["change"] == "added")
+    if len(changed) != count:
+        return set()
+    return {i for i, o in enumerate(changed) if o["family"] in _ROUND and o["texture"] == _PLAIN}
 
 
 def _masks(change: SceneChange, after: Path) -> Row:

@@ -154,13 +154,20 @@ def wilson(count: int, of: int) -> tuple[float, float]:
 
 
 def groups_table(rows: Sequence[Row], by: str) -> str | None:
-    """The main figures for each value of a fact ("path", "place"), or of the kinds that changed ("change")."""
+    """The main figures for each value of a fact ("path", "place") or of what changed ("change")."""
     known = told(rows)
-    values = {id(r): kinds(r.get("true")) if by == "change" else str(r.get("facts", {}).get(by, "–")) for r in known}
+    values = {id(r): _value(r, by) for r in known}
     names = sorted(set(values.values()))
     if not names or (by != "change" and names == ["–"]):
         return None
     return markdown([_group(by, name, [r for r in known if values[id(r)] == name]) for name in names])
+
+
+def _value(row: Row, by: str) -> str:
+    facts = row.get("facts", {})
+    if by == "change":
+        return ", ".join(facts["changes"]) or "nothing" if "changes" in facts else kinds(row.get("true"))
+    return str(facts.get(by, "–"))
 
 
 def told(rows: Sequence[Row]) -> list[Row]:
