@@ -114,15 +114,18 @@ def test_commands_are_watched(part, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert chain.failure(chain.commands_of(tmp_path))["command"] == "train"
 
 
-def test_a_scene_past_its_time_is_a_row(part, tmp_path: Path) -> None:
+def test_scenes_past_their_time_are_rows(part, tmp_path: Path) -> None:
     drive, trials = part("drive"), part("trials")
-    options = drive.Options(tmp_path / "out", limit=0.2)
-    (trial,) = trials.named_worlds(["cube"])
-    drive.run_all([trial], options)
-    row = read_json(options.folder(trial) / "row.json")
-    assert row["failed"]["how"] == "stopped" and options.finished(trial)
-    text = drive.tell([trial], [], options, part("ledger").Ledger(tmp_path / "use.json"))
-    assert "1 of 1" in text and (options.out / "worst.png").is_file()
+    options = drive.Options(tmp_path / "out", jobs=2, limit=0.2)
+    scenes = trials.named_worlds(["cube", "cone"])
+    drive.run_all(scenes, options)
+    rows = [read_json(options.folder(trial) / "row.json") for trial in scenes]
+    assert [(row["failed"]["how"], row["cores"]) for row in rows] == [("stopped", 1)] * 2
+    began = (options.folder(scenes[0]) / "row.json").stat().st_mtime_ns
+    drive.run_all(scenes, options)  # what is finished is not run again
+    assert (options.folder(scenes[0]) / "row.json").stat().st_mtime_ns == began
+    text = drive.tell(scenes, [], options, part("ledger").Ledger(tmp_path / "use.json"))
+    assert "2 of 2" in text and (options.out / "worst.png").is_file()
 
 
 def test_the_worst_come_first(part) -> None:
