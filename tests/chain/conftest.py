@@ -13,7 +13,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("REFIELD_TEST_DATA", ROOT.parent / "shared" / "data"))
-SMALL = ("--size", "96", "--cameras", "40", "--spp", "32")
+SMALL = ("--size", "96", "--spp", "32")
+NAMED, RANDOM = (*SMALL, "--cameras", "40"), (*SMALL, "--photos", "40")
 
 Row = dict[str, Any]
 
@@ -29,10 +30,11 @@ def gauntlet() -> Callable[[str], Any]:
 def world(gauntlet, tmp_path_factory) -> Callable[..., Row]:
     """Path-traces a world, fits, updates, renders, evaluates: the scene's row."""
 
-    def run(name: str, seed: int | None = None, synth: tuple[str, ...] = SMALL) -> Row:
-        trials = gauntlet("trials")
-        trial = trials.Trial(name, "named", seed, name, synth)
-        return gauntlet("row").run_trial(trial, tmp_path_factory.mktemp(name))
+    def run(name: str, seed: int | None = None) -> Row:
+        """A world by name, or with a seed the random one."""
+        trials, folder = gauntlet("trials"), tmp_path_factory.mktemp(name)
+        known = trials.random_worlds([seed], RANDOM) if seed is not None else trials.named_worlds([name], NAMED)
+        return gauntlet("row").run_trial(known[0], folder)
 
     return run
 

@@ -35,8 +35,19 @@ class Floors:
     """at most"""
 
 
-# FLOORS
-WORLDS: dict[str, Floors] = {}
+# The lower (of errors the higher) of what fits by seeds 0 and 1 gave on 2026-11-23 (one thread), less three times the
+# largest difference between the two in any of these worlds: 0.27 dB in, 0.42 out, 0.19 untouched, 0.023 % of the
+# distance and 0.10°. `python benchmarks/gauntlet.py --worlds … --synth "--size 96 --cameras 40 --spp 32" --train
+# "--fit.seed 1"` measures them.
+WORLDS = {
+    "cube": Floors(("moved",), psnr_in=29.9, psnr_out=27.2, untouched=33.5, off=0.10, degrees=0.43),
+    # the region of one of these touches that of the other, with a third apart from both
+    "two_moved": Floors(("moved", "moved"), psnr_in=29.5, psnr_out=32.0, untouched=35.3, off=0.12, degrees=0.65),
+    "added": Floors(("added",), psnr_in=19.9, untouched=32.8),
+    "removed": Floors(("removed",), psnr_out=32.4, untouched=34.9),
+    "tipped": Floors(("moved",), psnr_in=24.2, psnr_out=27.5, untouched=34.5, off=0.23, degrees=0.56),
+    "nothing": Floors((), untouched=33.5),
+}
 
 
 @pytest.mark.parametrize("name", WORLDS)
@@ -51,7 +62,8 @@ def check(row: dict[str, Any], floors: Floors) -> None:
     assert row["told"] == row["true"], row["objects"]
     assert row["right"], {k: row[k] for k in ("objects", "false", "pieces", "missed", "not understood")}
     moved = [o for o in row["objects"] if o["true"] == "moved"]
-    assert all(o["off, % of distance"] <= floors.off and o["off, °"] <= floors.degrees for o in moved), moved
+    for measure, most in (("off, % of distance", floors.off), ("off, °", floors.degrees)):
+        assert most is None or all(o[measure] <= most for o in moved), moved
     for name in ("psnr_in", "psnr_out"):
         least = getattr(floors, name)
         assert least is None or row[name] >= least, {k: v for k, v in row.items() if k.startswith("psnr")}
