@@ -25,16 +25,17 @@ def masks_of(folder: Path, name: str) -> dict[str, Tensor]:
 
 
 def tile(image: Tensor, masks: dict[str, Tensor]) -> Image.Image:
-    """The picture at the sheet's size, with a box around where something arrived and left (Fig. 8)."""
+    """The picture, its longer side the sheet's, with a box around where something arrived and left (Fig. 8)."""
     pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     h, w = image.shape[:2]
-    picture = Image.fromarray(pixels).resize((SIDE, round(SIDE * h / w)), Image.Resampling.BICUBIC)
+    scale = SIDE / max(h, w)
+    picture = Image.fromarray(pixels).resize((round(scale * w), round(scale * h)), Image.Resampling.BICUBIC)
     draw = ImageDraw.Draw(picture)
     for kind, ink in (("in", IN_COLOUR), ("out", OUT_COLOUR)):
         box = bounding_box(masks[kind].numpy(), margin=2) if kind in masks else None
         if box is not None:
-            draw.rectangle([v * SIDE / w for v in box], outline=ink, width=2)
-    return picture.crop((0, 0, SIDE, SIDE))
+            draw.rectangle([v * scale for v in box], outline=ink, width=2)
+    return picture
 
 
 def write_picture(path: Path, image: Image.Image) -> None:
