@@ -39,7 +39,7 @@ def main() -> int:
     synth, data = tuple(shlex.split(arguments.synth)), arguments.data if arguments.real else None
     trials, skipped = chosen(_seeds(arguments.seeds), arguments.worlds, data, synth)
     trials = [replace(t, train=tuple(shlex.split(arguments.train))) for t in trials]
-    ledger = Ledger(arguments.ledger)
+    ledger = Ledger(arguments.ledger, "rehearsals" if arguments.real else "worlds")
     try:
         if not trials:
             raise InputError("the gauntlet", "has nothing to run", "; ".join(skipped) or "give --seeds or --worlds")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from refield.scene.errors import InputError
 from refield.scene.files import read_json, write_json
@@ -13,12 +14,12 @@ _PURPOSES = {"developing": DEVELOPING, "reporting": REPORTING}
 
 
 class Ledger:
-    """Runs per seed, in a file that is committed."""
+    """Runs per seed, in a file that is committed; of random worlds, or of changes in real photographs."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        told = read_json(path)["runs"] if path.is_file() else {}
-        self.runs: dict[int, int] = {int(seed): int(count) for seed, count in told.items()}
+    def __init__(self, path: Path, of: Literal["worlds", "rehearsals"] = "worlds") -> None:
+        self.path, self._of = path, of
+        self._all = read_json(path) if path.is_file() else {}
+        self.runs: dict[int, int] = {int(seed): int(count) for seed, count in self._all.get(of, {}).items()}
 
     def claim(self, seeds: Sequence[int], *, again: bool) -> None:
         """Count a run of each seed, before it is run.
@@ -37,7 +38,7 @@ class Ledger:
         for seed in seeds:
             self.runs[seed] = self.runs.get(seed, 0) + 1
         if seeds:
-            write_json(self.path, {"runs": {str(s): self.runs[s] for s in sorted(self.runs)}})
+            write_json(self.path, self._all | {self._of: {str(s): self.runs[s] for s in sorted(self.runs)}})
 
     def told(self, seeds: Sequence[int]) -> str:
         """One line for a table: what the seeds are for, and how often they ran."""
