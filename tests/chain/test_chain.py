@@ -48,8 +48,10 @@ WORLDS = {
     "tipped": Floors(("moved",), psnr_in=24.2, psnr_out=27.5, untouched=34.5, off=0.23, degrees=0.56),
     "nothing": Floors((), untouched=33.5),
 }
+# Two objects that moved, one of them onto another (a seed for developing, 0 to 999). They are told in pieces, as added and
+# removed too, so that the kinds are not asked for; the margins are those of the worlds, from one fit.
 RANDOM = 0
-"""a seed for developing (0 to 999)"""
+RANDOM_FLOORS = Floors(("moved", "moved"), psnr_in=21.3, psnr_out=25.9, untouched=28.4)
 # Real photographs with a box composited in; found half a turn off with both seeds (177° and 180°), so no angle is asked
 # for. The two fits differ by 3.3 dB in and 4.3 out: of the lower one the margins of the worlds are taken.
 FOX = Floors(("moved",), psnr_in=17.6, psnr_out=12.9, untouched=23.1, off=0.77)
@@ -62,13 +64,18 @@ def test_world(name: str, world) -> None:
 
 def check(row: dict[str, Any], floors: Floors) -> None:
     """Every command ended well, what changed was understood, and the pictures are as good as they were measured."""
-    assert row["failed"] is None, row["failed"]
-    assert row["true"] == sorted(floors.true)
+    check_pictures(row, floors)
     assert row["told"] == row["true"], row["objects"]
     assert row["right"], {k: row[k] for k in ("objects", "false", "pieces", "missed", "not understood")}
     moved = [o for o in row["objects"] if o["true"] == "moved"]
     for measure, most in (("off, % of distance", floors.off), ("off, °", floors.degrees)):
         assert most is None or all(o[measure] <= most for o in moved), moved
+
+
+def check_pictures(row: dict[str, Any], floors: Floors) -> None:
+    """Every command ended well, and the pictures are as good as they were measured."""
+    assert row["failed"] is None, row["failed"]
+    assert row["true"] == sorted(floors.true)
     for name in ("psnr_in", "psnr_out"):
         least = getattr(floors, name)
         assert least is None or row[name] >= least, {k: v for k, v in row.items() if k.startswith("psnr")}
@@ -76,11 +83,9 @@ def check(row: dict[str, Any], floors: Floors) -> None:
 
 
 def test_random_world(world) -> None:
-    """Whatever the seed draws, the commands end well, and what did not change is shown no worse."""
     row = world("random", seed=RANDOM)
-    assert row["failed"] is None, row["failed"]
-    assert row["false"] == 0, row["objects"]
-    assert row["psnr_untouched"] >= row["psnr_untouched before"] - LOST
+    check_pictures(row, RANDOM_FLOORS)
+    assert row["false"] == 0 and row["missed"] == 0, row["objects"]
 
 
 def test_photographs(photographs) -> None:
