@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,7 +70,7 @@ def score(change: SceneChange, world: World, truth: SceneChange) -> Score:
     )
     alarms = len(change.objects) - len(pairs)
     masks = [
-        _pooled_iou(a, b) if a and b else None
+        pooled_iou(a, b) if a and b else None
         for a, b in ((change.masks_in, truth.masks_in), (change.masks_out, truth.masks_out))
     ]
     return Score(objects, alarms, masks[0], masks[1])
@@ -98,15 +98,20 @@ def _is_symmetric(item: Item) -> bool:
 
 
 def _iou(found: ObjectChange, item: Item) -> float:
-    grid: OccupancyGrid = found.grid
-    box = item.box().float()
+    return overlap(found.grid, item.box().float(), lambda x: item.distance(x.double()) < 0)
+
+
+def overlap(grid: OccupancyGrid, box: Tensor, inside: Callable[[Tensor], Tensor]) -> float:
+    """IoU of what a grid holds and another shape: ``inside`` says of points (N, 3) whether they are in it, and its
+    ``box`` (2, 3) holds all of it."""
     lo, hi = torch.minimum(grid.tight_aabb()[0], box[0]), torch.maximum(grid.tight_aabb()[1], box[1])
     x = lo + (hi - lo) * torch.rand(_PROBES, 3, generator=torch.Generator().manual_seed(0))
-    a, b = grid.contains(x), item.distance(x.double()) < 0
+    a, b = grid.contains(x), inside(x)
     return float((a & b).sum() / (a | b).sum().clamp_min(1))
 
 
-def _pooled_iou(a: Sequence[Tensor], b: Sequence[Tensor]) -> float | None:
+def pooled_iou(a: Sequence[Tensor], b: Sequence[Tensor]) -> float | None:
+    """Of masks (H, W) bool that go together, over all their pixels; None where both are empty."""
     both = sum(int((x & y).sum()) for x, y in zip(a, b))
     any_ = sum(int((x | y).sum()) for x, y in zip(a, b))
     return both / any_ if any_ else None

@@ -7,19 +7,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from PIL import Image, ImageDraw, ImageFont
-from torch import Tensor
 
-from refield.report.pictures import IN_COLOUR, OUT_COLOUR
 from refield.scene.files import write_bytes
-from refield.scene.images import frame_image, read_image, read_mask
+from refield.scene.images import frame_image, read_image
 from refield.scene.transforms_json import load_transforms
-from refield.vision.pixels import bounding_box
 from tables.cases import Case
 from tables.kept import Kept
 from tables.methods import VIEWS
 from tables.show import Found
+from tables.tiles import CAPTION, GAP, SIDE, masks_of, tile, write_picture
 
 COLUMNS = {
     "old": "before",
@@ -33,7 +30,6 @@ COLUMNS = {
 _INKS = {"ours": "#0f766e", "retrained": "#b45309", "retrained_long": "#d97706", "finetuned": "#7c3aed"}
 _SECONDS = [t * 10**k for k in range(5) for t in (1, 2, 5)]  # where a logarithmic axis is labelled
 _LABELS = {"retrained_long": "re-trained for longer"}
-_GAP, _CAPTION, _SIDE = 6, 20, 190
 
 
 def sheet(kept: Kept, cases: Sequence[Case], path: Path) -> bool:
@@ -42,16 +38,16 @@ def sheet(kept: Kept, cases: Sequence[Case], path: Path) -> bool:
     if not rows:
         return False
     columns = [c for c in ("new photo", *COLUMNS.values()) if any(c in row for row in rows)]
-    height = _CAPTION + len(rows) * (_SIDE + _GAP)
-    out = Image.new("RGB", (len(columns) * (_SIDE + _GAP) + _GAP, height), "white")
+    height = CAPTION + len(rows) * (SIDE + GAP)
+    out = Image.new("RGB", (len(columns) * (SIDE + GAP) + GAP, height), "white")
     draw, font = ImageDraw.Draw(out), ImageFont.load_default(13)
     for i, column in enumerate(columns):
-        x = _GAP + i * (_SIDE + _GAP)
-        draw.text((x, _CAPTION / 2), column, fill=(60, 60, 67), font=font, anchor="lm")
+        x = GAP + i * (SIDE + GAP)
+        draw.text((x, CAPTION / 2), column, fill=(60, 60, 67), font=font, anchor="lm")
         for j, row in enumerate(rows):
             if column in row:
-                out.paste(row[column], (x, _CAPTION + j * (_SIDE + _GAP)))
-    _write(path, out)
+                out.paste(row[column], (x, CAPTION + j * (SIDE + GAP)))
+    write_picture(path, out)
     return True
 
 
@@ -59,40 +55,16 @@ def _row(kept: Kept, case: Case) -> dict[str, Image.Image] | None:
     if kept.get(case.key, "ours") is None:
         return None
     frames = load_transforms(case.evaluation).frames
-    masks = {i: _masks(case.evaluation, f.path.name) for i, f in enumerate(frames)}
+    masks = {i: masks_of(case.evaluation, f.path.name) for i, f in enumerate(frames)}
     best = max(masks, key=lambda i: min((int(m.sum()) for m in masks[i].values()), default=0))
-    row = {"new photo": _tile(frame_image(case.frames[0]).float() / 255, {})}
+    row = {"new photo": tile(frame_image(case.frames[0]).float() / 255, {})}
     for method, title in COLUMNS.items():
         source = kept.pictures(case.key, method) / f"{best:04d}.png"
         if method == "truth":
-            row[title] = _tile(frame_image(frames[best]).float() / 255, masks[best])
+            row[title] = tile(frame_image(frames[best]).float() / 255, masks[best])
         elif source.is_file():
-            row[title] = _tile(read_image(source).float() / 255, masks[best])
+            row[title] = tile(read_image(source).float() / 255, masks[best])
     return row
-
-
-def _masks(folder: Path, name: str) -> dict[str, Tensor]:
-    paths = {kind: folder / f"masks_{kind}" / f"{Path(name).stem}.png" for kind in ("in", "out")}
-    return {kind: read_mask(p) for kind, p in paths.items() if p.is_file()}
-
-
-def _tile(image: Tensor, masks: dict[str, Tensor]) -> Image.Image:
-    """The picture at the sheet's size, with a box around where something arrived and left (Fig. 8)."""
-    pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    h, w = image.shape[:2]
-    tile = Image.fromarray(pixels).resize((_SIDE, round(_SIDE * h / w)), Image.Resampling.BICUBIC)
-    draw = ImageDraw.Draw(tile)
-    for kind, ink in (("in", IN_COLOUR), ("out", OUT_COLOUR)):
-        box = bounding_box(masks[kind].numpy(), margin=2) if kind in masks else None
-        if box is not None:
-            draw.rectangle([v * _SIDE / w for v in box], outline=ink, width=2)
-    return tile.crop((0, 0, _SIDE, _SIDE))
-
-
-def _write(path: Path, image: Image.Image) -> None:
-    buffer = io.BytesIO()
-    image.save(buffer, "PNG", optimize=True)
-    write_bytes(path, buffer.getvalue())
 
 
 # --- curves ---
