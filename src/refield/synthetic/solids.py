@@ -81,21 +81,19 @@ def _face(normal: NDArray[np.float64], offset: float, corners: NDArray[np.float6
     return _Face(normal, offset, axes, corners[np.argsort(np.arctan2(flat[:, 1], flat[:, 0]))])
 
 
-def hull_faces(points: NDArray[np.float64]) -> list[_Face]:
-    """The flat sides of the convex hull of (N, 3) points; triangles of one plane are one side."""
+def hull_faces(points: NDArray[np.float64], same: float = _SAME_PLANE) -> list[_Face]:
+    """The flat sides of the convex hull of (N, 3) points; what is of one plane, to ``same``, is one side."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(points)
-    scale = float(np.ptp(points, axis=0).max())
-    faces: list[_Face] = []
     corners = points[hull.vertices]
-    for *normal, shift in hull.equations:
-        known = any(
-            np.abs(f.normal - normal).max() < _SAME_PLANE and abs(f.offset + shift) < _SAME_PLANE * scale for f in faces
-        )
-        if not known:
-            on = np.abs(corners @ np.array(normal) + shift) < _SAME_PLANE * scale
-            faces.append(_face(np.array(normal), -float(shift), corners[on]))
+    scale = np.array([1, 1, 1, float(np.ptp(points, axis=0).max())])
+    planes, faces = hull.equations, []
+    while len(planes):
+        plane = planes[0]
+        planes = planes[(np.abs(planes - plane) >= same * scale).any(1)]
+        on = np.abs(corners @ plane[:3] + plane[3]) < same * scale[3]
+        faces.append(_face(plane[:3], -float(plane[3]), corners[on]))
     return faces
 
 
