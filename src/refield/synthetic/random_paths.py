@@ -95,7 +95,7 @@ def draw_path(rng: np.random.Generator, place: Place, camera: Camera) -> CameraP
     """A way around or before a place, from which its region about fills the picture."""
     family = str(rng.choice(list(place.views)))
     across = min(camera.width / camera.fx, camera.height / camera.fy) / 2
-    distance = place.reach * float(rng.uniform(0.95, 1.25)) / across
+    distance = place.reach * float(rng.uniform(0.8, 1.1)) / across
     low = float(rng.uniform(15, 35))
     laps = int(rng.integers(1, 4))
     azimuth, elevation = (0.0, 2 * np.pi), tuple(np.deg2rad(low + 14 * k) for k in range(laps))

@@ -167,7 +167,8 @@ class Convex:
         return torch.stack([u, v], -1)
 
     def mesh(self) -> Mesh:
-        vertices, uv, triangles, start = [], [], [], 0
+        vertices, uv, start = [], [], 0
+        triangles: list[list[int]] = []
         for i, face in enumerate(self.faces):
             count = len(face.corners)
             vertices.append(face.corners)
@@ -236,7 +237,8 @@ class RoundedBox:
         i = np.arange(_ACROSS * (_ACROSS + 1)).reshape(_ACROSS, -1)[:, :-1].ravel()
         quads = np.stack([i, i + _ACROSS + 1, i + _ACROSS + 2, i + 1], -1)
         half, inner = np.array(self.half), np.array(self.half) - self.radius
-        vertices, uv, faces = [], [], []
+        vertices: list[NDArray[np.float64]] = []
+        uv, faces = [], []
         for axis in range(3):
             for sign in (-1, 1):
                 cube = np.empty((len(first), 3))
