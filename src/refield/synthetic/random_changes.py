@@ -198,6 +198,8 @@ def top_of(item: Item) -> Top | None:
     middle = level[:, :2].mean(0)
     # the largest centred square that the samples of the top fill
     out = np.abs(on[:, :2] - middle).max(0)
+    if (out < 1e-6).any():  # a point, an edge
+        return None
     part = min(0.7, 0.7 * float(np.sqrt(len(np.unique((4 * (level[:, :2] - middle) / out).round(), axis=0)) / 60)))
     low, high = middle - part * out, middle + part * out
     wide = np.ptp(vertices[:, :2], axis=0)

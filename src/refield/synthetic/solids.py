@@ -18,8 +18,8 @@ from refield.synthetic.shapes import _INSET, Box, Mesh, Sphere
 
 Point = tuple[float, float, float]
 
-_STEPS = 400  # of a traced ray, at most; one in thousands grazes a surface for so long
-_NEAR = 1e-9  # metres from a surface at which a traced ray has met it
+_STEPS = 3000  # of a traced ray, at most: one that grazes a surface nears it by ever smaller steps
+_NEAR = 1e-7  # metres from a surface at which a traced ray has met it
 _SAME_PLANE = 1e-7
 _ACROSS = 12  # cells a side of a rounded face's mesh
 
