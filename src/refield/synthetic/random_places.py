@@ -63,6 +63,8 @@ class Place:
     faces_front: bool
     """whether something stands behind it, so that it is seen from the front only"""
     ground: str
+    front: float = -np.pi / 2
+    """radians: the azimuth from which it is seen"""
 
 
 _Furnish = Callable[[np.random.Generator, float], Place]
@@ -131,7 +133,7 @@ def _corner(rng: np.random.Generator, reach: float) -> Place:
         slab_item("side wall", (-far - _THICK, -long, 0), (-far, far, high), random_textures.wall(rng, 384)[1]),
     )
     target = (0.0, 0.0, 0.2 * reach)
-    return Place("", walls, (_square(reach, 0.75),), reach, target, 0.8 * reach, _FRONT, True, "")
+    return Place("", walls, (_square(reach, 0.75),), reach, target, 0.8 * reach, _FRONT, True, "", -np.pi / 4)
 
 
 def _desk(rng: np.random.Generator, reach: float) -> Place:

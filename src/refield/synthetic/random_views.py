@@ -13,7 +13,7 @@ from refield.scene.camera import Camera
 from refield.scene.capture import camera_rays
 from refield.scene.pose import invert, rotate, transform
 from refield.synthetic.random_scenes import Drawn
-from refield.synthetic.state import Item, State
+from refield.synthetic.state import Item, State, Triple
 from refield.synthetic.visibility import view_hits
 
 _WIDE = 40  # pixels, the longer side of the views that are tested
@@ -21,6 +21,7 @@ _SHOWN = 0.006  # of the picture: 98 pixels of 128 x 128
 _CLEAR = 0.25  # of an object's outline, that must be in sight
 _LARGEST = 0.3  # of the picture that an object may fill on the average
 _BEFORE_LENS = 0.12  # of the distance to the target: nothing may be nearer
+_BEFORE_TARGET = 0.7  # of the way to the target, that must be free
 _OLD_SHARE = 0.35  # of the old views that must show a changed object
 _PAINT, _OTHERWISE = 3.0, 0.15  # how much paint counts beside outline; what is needed of both
 _KEPT_SHARE = 0.15  # ... and one that stays
@@ -35,6 +36,7 @@ class Views:
     new: list[Tensor]
     evaluation: list[Tensor]
     distance: float
+    target: Triple = (0.0, 0.0, 0.0)
 
     @property
     def all(self) -> list[Tensor]:
@@ -49,10 +51,18 @@ class Views:
         return torch.stack([view_hits(state, self.small, pose).depth for pose in self.all])
 
     def clear(self, fixed: Tensor) -> bool:
-        """Whether no camera stands in or close before something, and the ground is seen in most."""
+        """Whether no camera stands in or close before something, and each has the target in sight."""
         there = fixed.isfinite().double().mean((1, 2))
         near = fixed.flatten(1).amin(1) > _BEFORE_LENS * self.distance
-        return bool(near.all()) and bool((there > 0.3).double().mean() > 0.7)
+        sight = [self._in_sight(pose, depth) for pose, depth in zip(self.all, fixed)]
+        return bool(near.all()) and all(sight) and bool((there > 0.3).double().mean() > 0.7)
+
+    def _in_sight(self, pose: Tensor, depth: Tensor) -> bool:
+        small, to = self.small, transform(invert(pose), torch.tensor([self.target], dtype=torch.float64))
+        pixel, z = small.project(to)
+        column, row = (int(v) for v in pixel[0].floor())
+        inside = float(z) > 0 and 0 <= column < small.width and 0 <= row < small.height
+        return inside and float(depth[row, column]) > _BEFORE_TARGET * float(to.norm())
 
 
 def seen_by(views: Views, fixed: Tensor, drawn: Drawn) -> dict[str, dict[str, float]] | None:

@@ -98,7 +98,14 @@ def _frame(rng: np.random.Generator) -> _Frame:
     setting = str(rng.choice(["room", "studio", "outdoors"], p=[0.4, 0.15, 0.45]))
     place, camera = draw_place(rng, outdoors=setting == "outdoors"), draw_camera(rng)
     path = draw_path(rng, place, camera)
-    views = Views(camera, path.poses(rng, _TESTED), path.new_poses(rng, NEW), path.new_poses(rng, NEW), path.distance)
+    views = Views(
+        camera,
+        path.poses(rng, _TESTED),
+        path.new_poses(rng, NEW),
+        path.new_poses(rng, NEW),
+        path.distance,
+        place.target,
+    )
     eyes = np.stack([pose[:3, 3].numpy() for pose in views.all])
     if setting == "room":
         wide = float(np.abs(eyes[:, :2]).max()) + float(rng.uniform(0.3, 1.0))
