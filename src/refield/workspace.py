@@ -39,7 +39,7 @@ from refield.scene.files import read_json, write_json
 from refield.scene.transforms_json import load_transforms, save_transforms
 from refield.scene.world import World, world_of
 
-__all__ = ["Workspace", "load_change", "save_change"]
+__all__ = ["Workspace", "load_change", "refuse_inside", "save_change"]
 
 MARKER, WORLD = "refield.json", "world.json"
 FORMAT = 1
@@ -47,6 +47,27 @@ CACHE = ".photos"
 """what structure from motion has found, kept while it goes on and for the next time; may be deleted"""
 _ARCHITECTURES: dict[str, type[HashField] | type[NerfactoField]] = {c.__name__: c for c in (HashField, NerfactoField)}
 _OURS = (MARKER, "capture", "field", "visits")
+
+
+def refuse_inside(*paths: Path) -> None:
+    """Check that none of ``paths``, where the user wants something written, is what a workspace keeps or lies in it.
+
+    A name of the user's own beside a workspace's entries is free. Links are followed.
+
+    Raises:
+        InputError: one is.
+    """
+    for path in paths:
+        try:
+            place = path.resolve()
+        except (OSError, RuntimeError):  # a loop of links
+            raise InputError(path, "cannot be resolved", "check the path and its links") from None
+        for root in place.parents:
+            # some file systems know no case
+            name = place.relative_to(root).parts[0].casefold()
+            if _is_kept(name) and _is_workspace(root):
+                what = f"belongs to the workspace {root}: nothing but refield's own steps writes there"
+                raise InputError(path, what, "choose another place, outside of what a workspace keeps")
 
 
 class Workspace:
@@ -76,11 +97,13 @@ class Workspace:
         """Check that a workspace may be made at ``path``, before any work.
 
         Raises:
-            InputError: something is there that we did not write, or a workspace and not ``overwrite``.
+            InputError: something is there that we did not write, or a workspace and not ``overwrite``; or it lies in
+                what another workspace keeps.
         """
+        refuse_inside(path)
         if path.exists() and not path.is_dir():
             raise InputError(path, "is a file, not a folder", "choose another output folder")
-        entries = [p for p in path.iterdir() if not _is_ours_hidden(p)] if path.exists() else []
+        entries = [p for p in path.iterdir() if not _is_hidden(p.name)] if path.exists() else []
         if (path / MARKER).is_file():
             if not overwrite:
                 what = "already holds a refield workspace"
@@ -122,6 +145,7 @@ class Workspace:
 
         Unlike the workspace it is there from the beginning, so that what was interrupted goes on.
         """
+        refuse_inside(path)
         existed = path.exists()
         with writable(path):
             (path / CACHE).mkdir(parents=True, exist_ok=True)
@@ -279,8 +303,18 @@ def _photo_at(photo: PlacedPhoto, frame: Frame) -> PlacedPhoto:
     return replace(photo, frame=frame)
 
 
-def _is_ours_hidden(path: Path) -> bool:
-    return path.name in (LOCK, CACHE) or path.name.startswith(PART)
+def _is_hidden(name: str) -> bool:
+    return name in (LOCK, CACHE) or name.startswith(PART)
+
+
+def _is_kept(name: str) -> bool:
+    """Whether a workspace's entry of this name is written by refield alone."""
+    return name in _OURS or _is_hidden(name)
+
+
+def _is_workspace(folder: Path) -> bool:
+    """Whether a workspace is there, or one in the making."""
+    return (folder / MARKER).is_file() or ((folder / CACHE).is_dir() and (folder / LOCK).is_file())
 
 
 def _swap_in(path: Path, part: Path) -> None:

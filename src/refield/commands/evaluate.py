@@ -19,11 +19,11 @@ from refield.history import state
 from refield.photos.taken import PhotoConfig
 from refield.scene.change import PlacedPhoto
 from refield.scene.errors import InputError
-from refield.scene.files import write_json
+from refield.scene.files import read_json, write_json
 from refield.scene.load import is_posed
 from refield.vision.perceptual import Perceptual, open_lpips
 from refield.vision.weights import WeightsError
-from refield.workspace import Workspace
+from refield.workspace import Workspace, refuse_inside
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,8 @@ class Evaluate:
 
 
 def run(options: Evaluate) -> None:
+    if options.out is not None:
+        _refuse_unless_free(options.out)
     perceptual = _opened(options.lpips)
     clock = Clock()
     workspace = Workspace.open(options.work)
@@ -67,6 +69,22 @@ def run(options: Evaluate) -> None:
             left_out = [{"name": p.name, "why": p.why} for p in placed if p.frame is None]
             write_json(options.out, report.to_dict() | {"left_out": left_out})
     results().print(table(report, f"visit {visit}"))
+
+
+def _refuse_unless_free(out: Path) -> None:
+    """Raises InputError: the numbers would replace what is none, or lie in what a workspace keeps."""
+    refuse_inside(out)
+    if out.is_dir():
+        raise InputError(out, "is a folder, not a file", "choose another --out")
+    if out.exists() and not _holds_numbers(out):
+        raise InputError(out, "is there and holds no numbers of refield evaluate", "choose another --out")
+
+
+def _holds_numbers(path: Path) -> bool:
+    try:
+        return {"pooled", "views"} <= read_json(path).keys()
+    except InputError:
+        return False
 
 
 def _placed(options: Evaluate, workspace: Workspace, clock: Clock, held: contextlib.ExitStack) -> list[PlacedPhoto]:

@@ -21,7 +21,7 @@ from refield.field.radiance import Field
 from refield.field.render import render_camera
 from refield.history import known_objects, retouched, state, untouched_psnr
 from refield.photos.taken import PhotoConfig
-from refield.report import summary, write_report
+from refield.report import summary, write_contact_sheet, write_report
 from refield.scene.capture import Capture
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
@@ -34,6 +34,7 @@ from refield.workspace import Workspace
 
 SHOWN = 256 * 256
 """pixels, about and at most, of what a field shows of a new photo; an update is judged by it, and the page shows it"""
+SHEET = "before-after.png"
 MOST_LOST = 0.2
 """dB that the unchanged pixels of the new photos may lose before an update is refused"""
 
@@ -67,6 +68,11 @@ class Visit:
     @property
     def html(self) -> Path:
         return self.folder / "report.html"
+
+    @property
+    def sheet(self) -> Path:
+        """The evaluation's views before and after; there is none without an evaluation or a change."""
+        return self.folder / SHEET
 
 
 def run(options: Update) -> None:
@@ -123,6 +129,8 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
             title = f"{options.work.resolve().name}, visit {number + 1}"
             report = page(title, change, (before, after), clock, evaluation, facts or {})
             write_report(folder, replace(report, world=workspace.world()))
+            if new is not None and report.evaluation_views:
+                write_contact_sheet(folder / SHEET, report.evaluation_views)
     return Visit(workspace.visit(number + 1), change, evaluation)
 
 
