@@ -95,3 +95,14 @@ def test_the_cameras_own_photos_are_not_replaced_unasked(place, capsys):
     assert main(["render", "work", "--cameras", "data/transforms.json", "--out", "data/images"]) == 2
     assert "000.png" in capsys.readouterr().err
     assert contents(place) == before
+
+
+@pytest.mark.parametrize("there", ["work", "data"])
+def test_the_demo_advises_nothing_that_it_refuses(place, capsys, there):
+    """A workspace that no demo made, and a folder of something else."""
+    before = contents(place)
+    assert main(["demo", there]) == 2
+    said = capsys.readouterr().err
+    assert "output folder" in said or "another folder" in said
+    assert "--" not in said
+    assert contents(place) == before

@@ -93,8 +93,9 @@ class Workspace:
         return Workspace(path)
 
     @staticmethod
-    def refuse_unless_free(path: Path, *, overwrite: bool) -> None:
-        """Check that a workspace may be made at ``path``, before any work.
+    def refuse_unless_free(path: Path, *, overwrite: bool, option: str | None = "--overwrite") -> None:
+        """Check that a workspace may be made at ``path``, before any work. ``option``: the command's that would allow
+        what is refused; None if it has none.
 
         Raises:
             InputError: something is there that we did not write, or a workspace and not ``overwrite``; or it lies in
@@ -107,7 +108,7 @@ class Workspace:
         if (path / MARKER).is_file():
             if not overwrite:
                 what = "already holds a refield workspace"
-                raise InputError(path, what, "choose another folder, or pass --overwrite")
+                raise InputError(path, what, f"choose another folder{f', or pass {option}' if option else ''}")
             return
         clash = [p.name for p in entries if p.name in _OURS]
         if clash:
@@ -115,7 +116,8 @@ class Workspace:
             raise InputError(path, what, "choose another output folder")
         if entries and not overwrite:
             what = f"is not empty and not a refield workspace ({entries[0].name}, …)"
-            raise InputError(path, what, "choose an empty output folder, or pass --overwrite to add to it")
+            more = f", or pass {option} to add to it" if option else ""
+            raise InputError(path, what, f"choose an empty output folder{more}")
 
     @staticmethod
     @contextlib.contextmanager

@@ -36,6 +36,7 @@ def run(options: Demo) -> None:
     clock = Clock()
     sample = sample_folder()
     again = Workspace.made_by(options.out) == "demo"
+    Workspace.refuse_unless_free(options.out, overwrite=again, option=None)
     task = Sources(sample / "before", options.out)
     psnr = train(task, clock, options.fit, overwrite=again, made_by="demo")
     facts = {} if math.isnan(psnr) else {"held-out PSNR of the field (dB)": round(psnr, 2)}
