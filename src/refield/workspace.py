@@ -127,7 +127,7 @@ class Workspace:
         It appears at ``path`` when the block ends well, not at all otherwise. What else lies there stays.
         """
         Workspace.refuse_unless_free(path, overwrite=overwrite)
-        existed = path.exists()
+        made = _missing(path)
         with writable(path):
             path.mkdir(parents=True, exist_ok=True)
         try:
@@ -137,8 +137,8 @@ class Workspace:
                 sync(part)
                 _swap_in(path, part)
         finally:
-            if not existed and not (path / MARKER).exists():
-                shutil.rmtree(path, ignore_errors=True)
+            if made and not (path / MARKER).exists():
+                _unmake(made)
 
     @staticmethod
     @contextlib.contextmanager
@@ -148,7 +148,7 @@ class Workspace:
         Unlike the workspace it is there from the beginning, so that what was interrupted goes on.
         """
         refuse_inside(path)
-        existed = path.exists()
+        made = _missing(path)
         with writable(path):
             (path / CACHE).mkdir(parents=True, exist_ok=True)
         try:
@@ -157,8 +157,8 @@ class Workspace:
         finally:
             if not any((path / CACHE).iterdir()):
                 (path / CACHE).rmdir()
-                if not existed:
-                    shutil.rmtree(path, ignore_errors=True)
+                if made:
+                    _unmake(made)
 
     @property
     def cache(self) -> Path:
@@ -303,6 +303,19 @@ def _copy_photos(folder: Path, frames: Sequence[Frame]) -> tuple[Frame, ...]:
 
 def _photo_at(photo: PlacedPhoto, frame: Frame) -> PlacedPhoto:
     return replace(photo, frame=frame)
+
+
+def _missing(path: Path) -> list[Path]:
+    """The folder ``path`` and those above it, as far as they are not there yet."""
+    return [p for p in (path, *path.parents) if not p.exists()]
+
+
+def _unmake(made: Sequence[Path]) -> None:
+    """Remove a folder, and those above it that were made for it and are empty."""
+    shutil.rmtree(made[0], ignore_errors=True)
+    with contextlib.suppress(OSError):
+        for above in made[1:]:
+            above.rmdir()
 
 
 def _is_hidden(name: str) -> bool:

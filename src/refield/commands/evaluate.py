@@ -14,9 +14,10 @@ from refield.artefacts import writable
 from refield.commands.clock import Clock, results
 from refield.commands.placing import Placing, placed_photos
 from refield.estimate.localize import LocalizeConfig
-from refield.evaluate import EvaluateConfig, Report, Scores, evaluate
+from refield.evaluate import EvaluateConfig, Report, Scores, evaluate, looked_over, need_masks
 from refield.history import state
-from refield.photos.taken import PhotoConfig
+from refield.photos.sources import find_sources
+from refield.photos.taken import PhotoConfig, Taken
 from refield.scene.change import PlacedPhoto
 from refield.scene.errors import InputError
 from refield.scene.files import read_json, write_json
@@ -55,12 +56,12 @@ def run(options: Evaluate) -> None:
     clock = Clock()
     workspace = Workspace.open(options.work)
     visit = workspace.chosen_visit(options.visit)
-    clock.stage(f"load the field as of visit {visit}")
-    now = state(workspace, visit)
-    before = state(workspace, 0) if visit else None
     with contextlib.ExitStack() as held:
         placed = [] if is_posed(options.eval) else _placed(options, workspace, clock, held)
-        views = [p.frame for p in placed if p.frame is not None] or None
+        views = looked_over(options.eval, [p.frame for p in placed if p.frame is not None] or None)
+        clock.stage(f"load the field as of visit {visit}")
+        now = state(workspace, visit)
+        before = state(workspace, 0) if visit else None
         clock.stage("evaluate")
         report = evaluate(now, options.eval, old=before, frames=views, config=options.config, perceptual=perceptual)
     clock.stop()
@@ -89,11 +90,16 @@ def _holds_numbers(path: Path) -> bool:
 
 def _placed(options: Evaluate, workspace: Workspace, clock: Clock, held: contextlib.ExitStack) -> list[PlacedPhoto]:
     """Photos without poses, in the workspace's world; their upright copies lie in its cache."""
-    held.enter_context(workspace.writing())
     inner = options.eval / "images"
     photos = inner if inner.is_dir() else options.eval  # masks are no photos
+    find_sources(photos)
+    held.enter_context(workspace.writing())
     how = Placing(options.intake, options.localize)
-    return placed_photos(photos, workspace, clock, how)
+
+    def check(photo: Taken) -> None:
+        need_masks(options.eval, photo.name, (photo.height, photo.width))
+
+    return placed_photos(photos, workspace, clock, how, check)
 
 
 def _opened(folder: Path | None) -> Perceptual | None:

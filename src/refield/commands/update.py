@@ -16,10 +16,11 @@ from refield.commands.page import page
 from refield.commands.placing import Placing, placed_photos
 from refield.estimate.localize import LocalizeConfig
 from refield.estimate.recipe import EstimateConfig, estimate_change
-from refield.evaluate import Report, evaluate
+from refield.evaluate import Report, evaluate, looked_over
 from refield.field.radiance import Field
 from refield.field.render import render_camera
 from refield.history import known_objects, retouched, state, untouched_psnr
+from refield.photos.sources import find_sources
 from refield.photos.taken import PhotoConfig
 from refield.report import summary, write_contact_sheet, write_report
 from refield.scene.capture import Capture
@@ -92,10 +93,14 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         InputError: no workspace, unusable photos, or an update that would make the field worse.
     """
     workspace = Workspace.open(options.work)
-    models = options.estimate.models.open()
     capture, given = workspace.capture(), None
     if is_posed(options.photos):
         given = load_new_photos(options.photos, capture, warn=clock.warn)
+    else:
+        find_sources(options.photos)
+    if options.evaluation is not None:
+        looked_over(options.evaluation)
+    models = options.estimate.models.open()
     with workspace.writing(), tempfile.TemporaryDirectory(prefix="refield-") as scratch:
         if given is None:
             how = Placing(options.intake, options.localize, models.describer)
