@@ -248,6 +248,14 @@ def test_faults_of_ours_keep_their_traceback(place, monkeypatch):
     assert not (place / "out").exists()
 
 
+@pytest.fixture
+def heeds_ctrl_c():
+    """Children stop at Ctrl-C even where the tests run in the background, in which shells have it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def training(place):
     """A training that would take for ever, in its own process, once it has begun."""
     argv = [sys.executable, "-m", "refield", "train", "data", "out", "--fit.steps", "100000"]
@@ -258,14 +266,14 @@ def training(place):
 
 
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_signals_leave_no_half_workspace(place, number, code):
+def test_signals_leave_no_half_workspace(place, heeds_ctrl_c, number, code):
     process = training(place)
     process.send_signal(number)
     assert process.wait(timeout=60) == code
     assert not (place / "out").exists()
 
 
-def test_an_interrupt_within_generated_code_has_the_same_exit_code(place):
+def test_an_interrupt_within_generated_code_has_the_same_exit_code(place, heeds_ctrl_c):
     # numba's compiler runs source text; CPython remembers a KeyboardInterrupt that passes through it
     code = """import sys, refield.cli
 text = "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(5)"

@@ -16,6 +16,7 @@ import pytest
 import torch
 from PIL import Image
 
+from refield.commands.visits import _told as visits_told
 from refield.report import (
     Comparison,
     VisitReport,
@@ -24,6 +25,7 @@ from refield.report import (
     write_contact_sheet,
     write_report,
 )
+from refield.report.page import html_page
 from refield.report.pictures import IN_COLOUR, OUT_COLOUR, data_uri, with_masks
 from refield.report.visit import object_shift, turn, uncertainty
 from refield.scene import pose
@@ -222,16 +224,33 @@ def test_uncertainty_is_that_of_sampled_poses() -> None:
     g = torch.Generator().manual_seed(0)
     root = torch.randn(6, 6, generator=g, dtype=torch.float64) * 1e-3
     change = moved(covariance=root @ root.T)
-    told = uncertainty(change)
+    told, centre = uncertainty(change), torch.tensor([2.0, 2, 2], dtype=torch.float64)
     twists = torch.randn(20000, 6, generator=g, dtype=torch.float64) @ root.T
-    centre = torch.tensor([2.0, 2, 2], dtype=torch.float64)
-    now = pose.transform(MOVE, centre)
-    places = (pose.exp(twists) @ torch.cat([now, torch.ones(1)]))[:, :3]
+    # two opposite sides, each anywhere in one of the grid's cells, which are 0.5 wide
+    centres = centre + ((torch.rand(20000, 2, 3, generator=g, dtype=torch.float64) - 0.5) * 0.5).mean(1)
+    shifts = pose.transform(pose.exp(twists) @ MOVE, centres) - centres
+    off = shifts - (pose.transform(MOVE, centre) - centre)
     assert told is not None
-    assert told[0] == pytest.approx(float((places - now).square().sum(-1).mean().sqrt()), rel=0.03)
+    assert told[0] == pytest.approx(float(off.square().sum(-1).mean().sqrt()), rel=0.03)
     angles = twists[:, 3:].square().sum(-1).mean().sqrt()
     assert told[1] == pytest.approx(math.degrees(float(angles)), rel=0.03)
     assert uncertainty(moved()) is None
+
+
+def test_a_move_is_told_as_one_length(tmp_path: Path) -> None:
+    """Of a thing that is larger on one side, and so has its middle elsewhere than its box."""
+    values = torch.zeros(9, 9, 9)
+    values[1:8, 1:8, 1:3] = 1
+    values[1:3, 1:3, 1:8] = 1
+    change = ObjectChange("moved", OccupancyGrid(grid(2.0).aabb, values), MOVE)
+    assert float((change.centre - change.grid.tight_aabb().mean(0)).norm()) > 0.1
+    assert change.shift is not None
+    length = float(change.shift.norm())
+    told = visit_report_dict(VisitReport("x", SceneChange((change,))))["objects"][0]
+    assert math.hypot(*told["shift"]) == pytest.approx(length)
+    assert math.hypot(*(object_shift(change) or ())) == pytest.approx(length)
+    assert visits_told(change)["moved_by"] == pytest.approx(length)
+    assert f"{length:.4g}" in html_page(VisitReport("x", SceneChange((change,))))
 
 
 def test_the_contact_sheet_shows_whole_rows_only(tmp_path: Path) -> None:

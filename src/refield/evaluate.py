@@ -21,11 +21,14 @@ from refield.scene.capture import Frame
 from refield.scene.errors import InputError
 from refield.scene.images import frame_image, read_mask
 from refield.scene.pose import angle_between, transform
-from refield.scene.transforms_json import load_transforms, stem
+from refield.scene.transforms_json import load_transforms, stem_of
 from refield.vision.alignment import align
 from refield.vision.perceptual import Perceptual, lpips_in_box
 from refield.vision.pixels import dilate
 from refield.vision.similarity import WINDOW, pooled_psnr, squared_error, ssim, ssim_in_box
+
+MASKS = ("masks_in", "masks_out")
+"""the folders of an evaluation's masks"""
 
 
 @dataclass(frozen=True)
@@ -128,11 +131,33 @@ def evaluate(
     """
     folder = Path(folder)
     views = []
-    for frame in load_transforms(folder).frames if frames is None else frames:
+    for frame in looked_over(folder, frames):
         if on_view is not None:
             on_view(frame.name)
         views.append(_scored(_view(field, old, folder, frame, config), config, perceptual))
     return _report(views, config)
+
+
+def looked_over(folder: Path, frames: Sequence[Frame] | None = None) -> Sequence[Frame]:
+    """The views that `evaluate` would compare, after a look at everything that it reads; nothing is rendered.
+
+    Raises:
+        InputError: as `evaluate`.
+    """
+    frames = load_transforms(folder).frames if frames is None else frames
+    for frame in frames:
+        need_masks(folder, frame.name, (frame.camera.height, frame.camera.width))
+    return frames
+
+
+def need_masks(folder: Path, name: str, shape: tuple[int, int]) -> None:
+    """Look at the masks of the view ``name`` of (H, W) pixels.
+
+    Raises:
+        InputError: one is missing or of another size.
+    """
+    for masks in MASKS:
+        _mask(folder / masks, name, shape)
 
 
 def rescored(
@@ -179,7 +204,8 @@ def pose_error(new_from_old: Tensor, true_new_from_old: Tensor, centre: Tensor) 
 
 def _view(new: Field, old: Field | None, folder: Path, frame: Frame, config: EvaluateConfig) -> ViewReport:
     truth = frame_image(frame).float() / 255
-    mask_in, mask_out = (_mask(folder / name, frame) for name in ("masks_in", "masks_out"))
+    shape = (frame.camera.height, frame.camera.width)
+    mask_in, mask_out = (_mask(folder / masks, frame.name, shape) for masks in MASKS)
     return ViewReport(
         name=frame.name,
         scores=Scores(),
@@ -214,14 +240,13 @@ def _rounded(rgb: Tensor) -> Tensor:
     return (rgb.clamp(0, 1) * 255).round() / 255
 
 
-def _mask(folder: Path, frame: Frame) -> Tensor | None:
+def _mask(folder: Path, name: str, expected: tuple[int, int]) -> Tensor | None:
     if not folder.is_dir():
         return None
-    path = folder / f"{stem(frame)}.png"
+    path = folder / f"{stem_of(name)}.png"
     if not path.is_file():
-        raise InputError(path, f"there is no mask for {frame.name}", "add it, all black if nothing changed there")
+        raise InputError(path, f"there is no mask for {name}", "add it, all black if nothing changed there")
     mask = read_mask(path)
-    expected = (frame.camera.height, frame.camera.width)
     if _is_larger(mask, expected):  # the photo was scaled down when it was taken in
         mask = functional.interpolate(mask[None, None].float(), expected, mode="nearest")[0, 0] > 0.5
     if tuple(mask.shape) != expected:

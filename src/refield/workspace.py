@@ -39,7 +39,7 @@ from refield.scene.files import read_json, write_json
 from refield.scene.transforms_json import load_transforms, save_transforms
 from refield.scene.world import World, world_of
 
-__all__ = ["Workspace", "load_change", "save_change"]
+__all__ = ["Workspace", "load_change", "refuse_inside", "save_change"]
 
 MARKER, WORLD = "refield.json", "world.json"
 FORMAT = 1
@@ -47,6 +47,27 @@ CACHE = ".photos"
 """what structure from motion has found, kept while it goes on and for the next time; may be deleted"""
 _ARCHITECTURES: dict[str, type[HashField] | type[NerfactoField]] = {c.__name__: c for c in (HashField, NerfactoField)}
 _OURS = (MARKER, "capture", "field", "visits")
+
+
+def refuse_inside(*paths: Path) -> None:
+    """Check that none of ``paths``, where the user wants something written, is what a workspace keeps or lies in it.
+
+    A name of the user's own beside a workspace's entries is free. Links are followed.
+
+    Raises:
+        InputError: one is.
+    """
+    for path in paths:
+        try:
+            place = path.resolve()
+        except (OSError, RuntimeError):  # a loop of links
+            raise InputError(path, "cannot be resolved", "check the path and its links") from None
+        for root in place.parents:
+            # some file systems know no case
+            name = place.relative_to(root).parts[0].casefold()
+            if _is_kept(name) and _is_workspace(root):
+                what = f"belongs to the workspace {root}: nothing but refield's own steps writes there"
+                raise InputError(path, what, "choose another place, outside of what a workspace keeps")
 
 
 class Workspace:
@@ -72,19 +93,22 @@ class Workspace:
         return Workspace(path)
 
     @staticmethod
-    def refuse_unless_free(path: Path, *, overwrite: bool) -> None:
-        """Check that a workspace may be made at ``path``, before any work.
+    def refuse_unless_free(path: Path, *, overwrite: bool, option: str | None = "--overwrite") -> None:
+        """Check that a workspace may be made at ``path``, before any work. ``option``: the command's that would allow
+        what is refused; None if it has none.
 
         Raises:
-            InputError: something is there that we did not write, or a workspace and not ``overwrite``.
+            InputError: something is there that we did not write, or a workspace and not ``overwrite``; or it lies in
+                what another workspace keeps.
         """
+        refuse_inside(path)
         if path.exists() and not path.is_dir():
             raise InputError(path, "is a file, not a folder", "choose another output folder")
-        entries = [p for p in path.iterdir() if not _is_ours_hidden(p)] if path.exists() else []
+        entries = [p for p in path.iterdir() if not _is_hidden(p.name)] if path.exists() else []
         if (path / MARKER).is_file():
             if not overwrite:
                 what = "already holds a refield workspace"
-                raise InputError(path, what, "choose another folder, or pass --overwrite")
+                raise InputError(path, what, f"choose another folder{f', or pass {option}' if option else ''}")
             return
         clash = [p.name for p in entries if p.name in _OURS]
         if clash:
@@ -92,7 +116,8 @@ class Workspace:
             raise InputError(path, what, "choose another output folder")
         if entries and not overwrite:
             what = f"is not empty and not a refield workspace ({entries[0].name}, …)"
-            raise InputError(path, what, "choose an empty output folder, or pass --overwrite to add to it")
+            more = f", or pass {option} to add to it" if option else ""
+            raise InputError(path, what, f"choose an empty output folder{more}")
 
     @staticmethod
     @contextlib.contextmanager
@@ -102,7 +127,7 @@ class Workspace:
         It appears at ``path`` when the block ends well, not at all otherwise. What else lies there stays.
         """
         Workspace.refuse_unless_free(path, overwrite=overwrite)
-        existed = path.exists()
+        made = _missing(path)
         with writable(path):
             path.mkdir(parents=True, exist_ok=True)
         try:
@@ -112,8 +137,8 @@ class Workspace:
                 sync(part)
                 _swap_in(path, part)
         finally:
-            if not existed and not (path / MARKER).exists():
-                shutil.rmtree(path, ignore_errors=True)
+            if made and not (path / MARKER).exists():
+                _unmake(made)
 
     @staticmethod
     @contextlib.contextmanager
@@ -122,7 +147,8 @@ class Workspace:
 
         Unlike the workspace it is there from the beginning, so that what was interrupted goes on.
         """
-        existed = path.exists()
+        refuse_inside(path)
+        made = _missing(path)
         with writable(path):
             (path / CACHE).mkdir(parents=True, exist_ok=True)
         try:
@@ -131,8 +157,8 @@ class Workspace:
         finally:
             if not any((path / CACHE).iterdir()):
                 (path / CACHE).rmdir()
-                if not existed:
-                    shutil.rmtree(path, ignore_errors=True)
+                if made:
+                    _unmake(made)
 
     @property
     def cache(self) -> Path:
@@ -279,8 +305,31 @@ def _photo_at(photo: PlacedPhoto, frame: Frame) -> PlacedPhoto:
     return replace(photo, frame=frame)
 
 
-def _is_ours_hidden(path: Path) -> bool:
-    return path.name in (LOCK, CACHE) or path.name.startswith(PART)
+def _missing(path: Path) -> list[Path]:
+    """The folder ``path`` and those above it, as far as they are not there yet."""
+    return [p for p in (path, *path.parents) if not p.exists()]
+
+
+def _unmake(made: Sequence[Path]) -> None:
+    """Remove a folder, and those above it that were made for it and are empty."""
+    shutil.rmtree(made[0], ignore_errors=True)
+    with contextlib.suppress(OSError):
+        for above in made[1:]:
+            above.rmdir()
+
+
+def _is_hidden(name: str) -> bool:
+    return name in (LOCK, CACHE) or name.startswith(PART)
+
+
+def _is_kept(name: str) -> bool:
+    """Whether a workspace's entry of this name is written by refield alone."""
+    return name in _OURS or _is_hidden(name)
+
+
+def _is_workspace(folder: Path) -> bool:
+    """Whether a workspace is there, or one in the making."""
+    return (folder / MARKER).is_file() or ((folder / CACHE).is_dir() and (folder / LOCK).is_file())
 
 
 def _swap_in(path: Path, part: Path) -> None:

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from refield.estimate import recipe
 from refield.estimate.alone import object_alone
-from refield.estimate.associate import AssociateConfig, is_sunk, take_off, trimmed
+from refield.estimate.associate import AssociateConfig, is_sunk, looks_gone, take_off, trimmed
 from refield.estimate.conclude import _shown_in
 from refield.estimate.detail import detail_of
 from refield.estimate.explain import explained_before
@@ -63,7 +63,7 @@ def stage(tmp_path_factory):
     (old,) = recipe._were_there(
         scene, carved, changed_parts(scene.changed, carved, free, 40, scene.models.segmenter)[0]
     )
-    past = look_past(BEFORE, scene.changed, scene.survey, [old], config.detect)
+    past = look_past(BEFORE, scene.changed, scene.survey, [old], (config.detect, config.hull))
     return Stage(scene, old, past, capture, frames)
 
 
@@ -86,6 +86,21 @@ def test_the_object_is_known_to_be_gone(stage):
     assert changed_share(stage.scene.changed, stage.old) > 0.8
     share, asked = gone_score(stage.past, stage.old)
     assert share > 0.5 and asked > 50
+
+
+def test_looking_past_it_heeds_how_near_to_a_surface_is_on_it(stage):
+    """To one who takes everything for the same surface, nothing was taken off it."""
+    told = {}
+    for surface in (HullConfig().surface, 1e4):
+        ground = SimpleNamespace(
+            field=BEFORE,
+            survey=stage.scene.survey,
+            detect=stage.scene.config.detect,
+            carving=HullConfig(surface=surface),
+            believe=AssociateConfig(),
+        )
+        told[surface] = looks_gone(ground, stage.scene.changed, stage.old)
+    assert list(told.values()) == [True, False]
 
 
 def test_registration_finds_the_turn(stage):
@@ -174,7 +189,7 @@ def test_an_object_behind_everything_is_not_shown_and_breaks_nothing(stage):
 def test_the_outline_of_a_moved_object_is_whole_in_photos_larger_than_the_working_size(stage):
     config = recipe.EstimateConfig(survey=6, max_pixels=1200)
     small = recipe._detected(stage.capture, BEFORE, stage.frames, config, Models())
-    past = look_past(BEFORE, small.changed, small.survey, [stage.old], config.detect)
+    past = look_past(BEFORE, small.changed, small.survey, [stage.old], (config.detect, config.hull))
     found = refine(Sight(BEFORE, stage.old, past, [stage.old]), TRUE)
     sight = Sight(BEFORE, stage.old, take_off(BEFORE, past, stage.old, found), [stage.old])
     masks = _shown_in(sight, found.new_from_old)

@@ -53,7 +53,7 @@ def test_a_moved_box_is_found_with_its_pose_shape_and_masks(old, tmp_path):
     held, iou = overlap(moved.grid, CRATE)
     assert held > 0.88 and iou > 0.8
     assert torch.linalg.eigvalsh(moved.covariance).min() > 0
-    assert "1 moved by" in change.why
+    assert f"1 moved by {float(moved.shift.norm()):.4g} " in change.why  # as the report tells it
     assert len(moved.masks) == len(moved.masks_in) == len(old.train)
     assert all(m.shape == (80, 80) and m.dtype == torch.bool for m in moved.masks)
     assert len(change.masks_in) == 4 and change.frames[0].name == "000.png"

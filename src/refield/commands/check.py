@@ -22,7 +22,7 @@ from refield.scene.errors import InputError
 from refield.scene.images import is_ours, write_image
 from refield.scene.left_out import named
 from refield.scene.load import is_posed, load_capture
-from refield.workspace import MARKER, Workspace
+from refield.workspace import MARKER, Workspace, refuse_inside
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Check:
 
 def run(options: Check) -> None:
     clock = Clock()
+    refuse_inside(options.picture, *([] if options.work is None else [options.work]))
     if options.picture.exists() and not is_ours(options.picture):
         raise InputError(options.picture, "is there and was not made by refield", "choose another --picture")
     survey = check(options, clock)

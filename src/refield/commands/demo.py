@@ -12,12 +12,11 @@ from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock, results
 from refield.commands.evaluate import table
-from refield.commands.page import evaluation_views
 from refield.commands.train import Sources, train
 from refield.commands.update import Update, Visit, update
 from refield.evaluate import pose_error
 from refield.field.fit import FitConfig
-from refield.report import summary, write_contact_sheet
+from refield.report import summary
 from refield.scene.change import SceneChange
 from refield.scene.change_files import load_change
 from refield.synthetic import sample_folder
@@ -37,15 +36,15 @@ def run(options: Demo) -> None:
     clock = Clock()
     sample = sample_folder()
     again = Workspace.made_by(options.out) == "demo"
+    Workspace.refuse_unless_free(options.out, overwrite=again, option=None)
     task = Sources(sample / "before", options.out)
     psnr = train(task, clock, options.fit, overwrite=again, made_by="demo")
     facts = {} if math.isnan(psnr) else {"held-out PSNR of the field (dB)": round(psnr, 2)}
     visit = update(Update(options.out, sample / "after", evaluation=sample / "eval"), clock, facts)
-    sheet = options.out / "before-after.png"
-    if visit.evaluation is not None:
-        write_contact_sheet(sheet, evaluation_views(visit.evaluation))
     _show(visit, load_change(sample / "truth"), psnr, clock)
-    print(f"report: {visit.html}\nbefore and after: {sheet}")
+    print(f"report: {visit.html}")
+    if visit.sheet.exists():
+        print(f"before and after: {visit.sheet}")
 
 
 def _show(visit: Visit, truth: SceneChange, psnr: float, clock: Clock) -> None:

@@ -14,16 +14,17 @@ from refield.artefacts import writable
 from refield.commands.clock import Clock, results
 from refield.commands.placing import Placing, placed_photos
 from refield.estimate.localize import LocalizeConfig
-from refield.evaluate import EvaluateConfig, Report, Scores, evaluate
+from refield.evaluate import EvaluateConfig, Report, Scores, evaluate, looked_over, need_masks
 from refield.history import state
-from refield.photos.taken import PhotoConfig
+from refield.photos.sources import find_sources
+from refield.photos.taken import PhotoConfig, Taken
 from refield.scene.change import PlacedPhoto
 from refield.scene.errors import InputError
-from refield.scene.files import write_json
+from refield.scene.files import read_json, write_json
 from refield.scene.load import is_posed
 from refield.vision.perceptual import Perceptual, open_lpips
 from refield.vision.weights import WeightsError
-from refield.workspace import Workspace
+from refield.workspace import Workspace, refuse_inside
 
 
 @dataclass(frozen=True)
@@ -49,16 +50,18 @@ class Evaluate:
 
 
 def run(options: Evaluate) -> None:
+    if options.out is not None:
+        _refuse_unless_free(options.out)
     perceptual = _opened(options.lpips)
     clock = Clock()
     workspace = Workspace.open(options.work)
     visit = workspace.chosen_visit(options.visit)
-    clock.stage(f"load the field as of visit {visit}")
-    now = state(workspace, visit)
-    before = state(workspace, 0) if visit else None
     with contextlib.ExitStack() as held:
         placed = [] if is_posed(options.eval) else _placed(options, workspace, clock, held)
-        views = [p.frame for p in placed if p.frame is not None] or None
+        views = looked_over(options.eval, [p.frame for p in placed if p.frame is not None] or None)
+        clock.stage(f"load the field as of visit {visit}")
+        now = state(workspace, visit)
+        before = state(workspace, 0) if visit else None
         clock.stage("evaluate")
         report = evaluate(now, options.eval, old=before, frames=views, config=options.config, perceptual=perceptual)
     clock.stop()
@@ -69,13 +72,34 @@ def run(options: Evaluate) -> None:
     results().print(table(report, f"visit {visit}"))
 
 
+def _refuse_unless_free(out: Path) -> None:
+    """Raises InputError: the numbers would replace what is none, or lie in what a workspace keeps."""
+    refuse_inside(out)
+    if out.is_dir():
+        raise InputError(out, "is a folder, not a file", "choose another --out")
+    if out.exists() and not _holds_numbers(out):
+        raise InputError(out, "is there and holds no numbers of refield evaluate", "choose another --out")
+
+
+def _holds_numbers(path: Path) -> bool:
+    try:
+        return {"pooled", "views"} <= read_json(path).keys()
+    except InputError:
+        return False
+
+
 def _placed(options: Evaluate, workspace: Workspace, clock: Clock, held: contextlib.ExitStack) -> list[PlacedPhoto]:
     """Photos without poses, in the workspace's world; their upright copies lie in its cache."""
-    held.enter_context(workspace.writing())
     inner = options.eval / "images"
     photos = inner if inner.is_dir() else options.eval  # masks are no photos
+    find_sources(photos)
+    held.enter_context(workspace.writing())
     how = Placing(options.intake, options.localize)
-    return placed_photos(photos, workspace, clock, how)
+
+    def check(photo: Taken) -> None:
+        need_masks(options.eval, photo.name, (photo.height, photo.width))
+
+    return placed_photos(photos, workspace, clock, how, check)
 
 
 def _opened(folder: Path | None) -> Perceptual | None:

@@ -18,7 +18,7 @@ from refield.scene.errors import InputError
 from refield.scene.images import is_ours, write_image
 from refield.scene.left_out import named
 from refield.scene.transforms_json import load_cameras, stem
-from refield.workspace import Workspace
+from refield.workspace import Workspace, refuse_inside
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ def output_paths(cameras: Path, frames: list[Frame], out: Path, *, overwrite: bo
     """Where each frame's picture goes.
 
     Raises:
-        InputError: two frames share a name, a name is none, or a picture that is not ours would be replaced.
+        InputError: two frames share a name, a name is none, a picture that is not ours or is one of the cameras' own
+            photos would be replaced, or they would lie in what a workspace keeps.
     """
     stems = [stem(frame) for frame in frames]
     twice = sorted({s for s in stems if stems.count(s) > 1})
@@ -75,8 +76,10 @@ def output_paths(cameras: Path, frames: list[Frame], out: Path, *, overwrite: bo
     if out.exists() and not out.is_dir():
         raise InputError(out, "is a file, not a folder", "choose another output folder")
     paths = [out / f"{s}.png" for s in stems]
-    foreign = [p.name for p in paths if p.exists() and not is_ours(p)]
+    refuse_inside(out, *paths)
+    photos = {frame.path.resolve() for frame in frames}  # refield may have written them too: those of a made-up world
+    foreign = [p.name for p in paths if p.exists() and (not is_ours(p) or p.resolve() in photos)]
     if foreign and not overwrite:
-        what = f"holds pictures that refield did not write ({named(foreign)})"
+        what = f"holds pictures that refield render did not write ({named(foreign)})"
         raise InputError(out, what, "choose another output folder, or pass --overwrite")
     return paths

@@ -16,6 +16,7 @@ from refield.field.nerfacto import NerfactoField
 from refield.field.radiance import HashField
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
 from refield.photos.landmarks import Landmarks, write_landmarks
+from refield.photos.sources import find_sources
 from refield.scene.capture import Capture, centres
 from refield.scene.errors import InputError
 from refield.scene.load import is_posed, load_capture
@@ -117,6 +118,7 @@ def _loaded(task: Sources, clock: Clock) -> tuple[Capture, Landmarks | None]:
     if is_posed(task.data):
         clock.stage("load the capture")
         return load_capture(task.data, warn=clock.warn), None
+    find_sources(task.data)
     clock.stage("find where the photos were taken")
     with Workspace.caching(task.work) as cache, clock.counters() as counting:
         found = capture_from_photos(task.data, cache, task.poses, warn=clock.warn, counting=counting)

@@ -16,12 +16,13 @@ from refield.commands.page import page
 from refield.commands.placing import Placing, placed_photos
 from refield.estimate.localize import LocalizeConfig
 from refield.estimate.recipe import EstimateConfig, estimate_change
-from refield.evaluate import Report, evaluate
+from refield.evaluate import Report, evaluate, looked_over
 from refield.field.radiance import Field
 from refield.field.render import render_camera
 from refield.history import known_objects, retouched, state
+from refield.photos.sources import find_sources
 from refield.photos.taken import PhotoConfig
-from refield.report import summary, write_report
+from refield.report import summary, write_contact_sheet, write_report
 from refield.scene.capture import Capture
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
@@ -34,6 +35,7 @@ from refield.workspace import Workspace
 
 SHOWN = 256 * 256
 """pixels, about and at most, of what a field shows of a new photo on the page"""
+SHEET = "before-after.png"
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,11 @@ class Visit:
     def html(self) -> Path:
         return self.folder / "report.html"
 
+    @property
+    def sheet(self) -> Path:
+        """The evaluation's views before and after; there is none without an evaluation or a change."""
+        return self.folder / SHEET
+
 
 def run(options: Update) -> None:
     clock = Clock()
@@ -84,10 +91,14 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         InputError: no workspace, or unusable photos.
     """
     workspace = Workspace.open(options.work)
-    models = options.estimate.models.open()
     capture, given = workspace.capture(), None
     if is_posed(options.photos):
         given = load_new_photos(options.photos, capture, warn=clock.warn)
+    else:
+        find_sources(options.photos)
+    if options.evaluation is not None:
+        looked_over(options.evaluation)
+    models = options.estimate.models.open()
     with workspace.writing(), tempfile.TemporaryDirectory(prefix="refield-") as scratch:
         if given is None:
             how = Placing(options.intake, options.localize, models.describer)
@@ -120,6 +131,8 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
             title = f"{options.work.resolve().name}, visit {number + 1}"
             report = page(title, change, (before, after), clock, evaluation, facts or {})
             write_report(folder, replace(report, world=workspace.world()))
+            if new is not None and report.evaluation_views:
+                write_contact_sheet(folder / SHEET, report.evaluation_views)
     return Visit(workspace.visit(number + 1), change, evaluation)
 
 

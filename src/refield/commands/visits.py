@@ -60,7 +60,7 @@ def _told(o: ObjectChange) -> dict[str, Any]:
     shift = object_shift(o)
     return {
         "kind": o.kind,
-        "at": [round(v, 4) for v in o.grid.tight_aabb().mean(0).tolist()],
+        "at": [round(v, 4) for v in o.centre.tolist()],
         "moved_by": None if shift is None else math.hypot(*shift),
         "turned_by_deg": None if o.new_from_old is None else turn(o.new_from_old)[0],
         "confidence": o.confidence,
@@ -86,7 +86,7 @@ def _table(visits: list[dict[str, Any]]) -> Table:
 
 
 def _line(o: dict[str, Any]) -> str:
-    at = ", ".join(f"{v:.3g}" for v in o["at"])
+    at = ", ".join(f"{v:.4g}" for v in o["at"])
     if o["moved_by"] is None:
         return f"{o['kind']} at ({at})"
-    return f"moved from ({at}) by {o['moved_by']:.3g}, turned {o['turned_by_deg']:.1f}°"
+    return f"moved from ({at}) by {o['moved_by']:.4g}, turned {o['turned_by_deg']:.1f}°"

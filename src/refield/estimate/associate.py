@@ -133,7 +133,7 @@ class Fit:
 def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> Settled:
     """Find each old object's new place or that it left, and what else arrived."""
     touched = [k for k, old in enumerate(olds) if changed_share(changed, old) >= ground.believe.touched]
-    views = look_past(ground.field, changed, ground.survey, [olds[k] for k in touched], ground.detect)
+    views = look_past(ground.field, changed, ground.survey, [olds[k] for k in touched], (ground.detect, ground.carving))
     moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, views)
     trimmed_some = any(placed[k] is not olds[k] for k in touched)
     olds = [placed.get(k, old) for k, old in enumerate(olds)]
@@ -141,7 +141,9 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
     removed = {k: share for k, share in shares.items() if share is not None}
     kept = [k for k in touched if k in moved or k in removed]
     if len(kept) < len(touched) or trimmed_some:  # what never left hides what is behind it after all
-        views = look_past(ground.field, changed, ground.survey, [olds[k] for k in kept], ground.detect)
+        views = look_past(
+            ground.field, changed, ground.survey, [olds[k] for k in kept], (ground.detect, ground.carving)
+        )
         for k, change in moved.items():
             views = take_off(ground.field, views, olds[k], change)
     gone = [olds[k] for k in kept]
@@ -175,7 +177,7 @@ def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
     """Whether an object's pixels changed and show what was behind it."""
     if changed_share(changed, old) < ground.believe.touched:
         return False
-    views = look_past(ground.field, changed, ground.survey, [old], ground.detect)
+    views = look_past(ground.field, changed, ground.survey, [old], (ground.detect, ground.carving))
     return _gone(ground, views, old) is not None
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -82,7 +82,7 @@ def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...]) -> 
 def _moved(frames: Sequence[Frame], old: Old, change: PoseChange) -> ObjectChange:
     centre = transform(change.new_from_old, torch.from_numpy(old.centre).double())
     about = adjoint(rigid(torch.eye(3, dtype=torch.float64), centre))
-    return ObjectChange(
+    moved = ObjectChange(
         "moved",
         old.shape,
         change.new_from_old,
@@ -90,8 +90,8 @@ def _moved(frames: Sequence[Frame], old: Old, change: PoseChange) -> ObjectChang
         segment.masks_in(frames, old.shape.moved(change.new_from_old)),
         confidence=change.explained,
         covariance=about @ change.covariance @ about.T,
-        note=_why_moved(old, change),
     )
+    return replace(moved, note=_why_moved(moved, change))
 
 
 def _masks_of(frames: Sequence[Frame], old: Old) -> tuple[Tensor | None, ...]:
@@ -99,12 +99,12 @@ def _masks_of(frames: Sequence[Frame], old: Old) -> tuple[Tensor | None, ...]:
     return segment.masks_in(frames, old.shape) if old.remembered else segment.masks_out(frames, old)
 
 
-def _why_moved(old: Old, change: PoseChange) -> str:
-    centre = torch.from_numpy(old.centre).double()
-    shift = float((transform(change.new_from_old, centre) - centre).norm())
+def _why_moved(moved: ObjectChange, change: PoseChange) -> str:
+    assert moved.shift is not None
+    shift = float(moved.shift.norm())
     turn = float(angle_between(change.new_from_old, torch.eye(4, dtype=torch.float64)))
     return (
-        f"moved by {shift:.3g} and turned by {turn:.0f} degrees, {100 * change.explained:.0f} % of its pixels show it"
+        f"moved by {shift:.4g} and turned by {turn:.0f} degrees, {100 * change.explained:.0f} % of its pixels show it"
         f" at its new place, {100 * change.before:.0f} % what was there before"
     ) + (f"; {change.note}" if change.note else "")
 

@@ -18,13 +18,15 @@ from torch import Tensor
 from refield.estimate.absolute_pose import Solved, solve
 from refield.estimate.intrinsics import guesses
 from refield.photos.features import photo_features
-from refield.photos.gather import OnProgress, gather
+from refield.photos.gather import Gathered, OnProgress, gather
 from refield.photos.landmarks import Landmarks, describe, read_landmarks, triangulated, write_landmarks
 from refield.photos.motion import Counting, silent
 from refield.photos.taken import PhotoConfig, Taken, pixels_of
 from refield.scene.capture import Capture, Frame, centres
 from refield.scene.change import PlacedPhoto, Placement
+from refield.scene.errors import InputError
 from refield.scene.images import read_image
+from refield.scene.left_out import named
 from refield.vision.describer import Describer
 from refield.vision.sift import Features, match_landmarks, unit
 
@@ -93,11 +95,29 @@ def localize_photos(
         photos: how they are taken in.
 
     Raises:
-        InputError: there are no photos.
+        InputError: there are no photos, or none that can be used.
     """
-    count = counting or silent
-    gathered = gather(folder, cache / "new", photos or PhotoConfig(), count("photos"), among=False)
-    placed = localize(gathered.photos, known, config, count("placed"))
+    return localize_taken(take_in(folder, cache, photos, counting), known, config, counting)
+
+
+def take_in(folder: Path, cache: Path, photos: PhotoConfig | None = None, counting: Counting | None = None) -> Gathered:
+    """The first half of `localize_photos`, which needs nothing but the new photos.
+
+    Raises:
+        InputError: there are none, or none that can be used.
+    """
+    gathered = gather(folder, cache / "new", photos, (counting or silent)("photos"), among=False)
+    if not gathered.photos:
+        reasons = named([f"{name} {why}" for name, why in gathered.left_out])
+        raise InputError(folder, f"none of its {len(gathered.left_out)} photos can be used ({reasons})", "replace them")
+    return gathered
+
+
+def localize_taken(
+    gathered: Gathered, known: Known, config: LocalizeConfig = LocalizeConfig(), counting: Counting | None = None
+) -> list[PlacedPhoto]:
+    """The second half of `localize_photos`."""
+    placed = localize(gathered.photos, known, config, (counting or silent)("placed"))
     return [*placed, *(PlacedPhoto(name, "rejected", why) for name, why in gathered.left_out)]
 
 

@@ -61,14 +61,24 @@ class Past:
 
 
 def look_past(
-    field: Field, changed: Sequence[Changed], survey: Sequence[View], olds: Sequence[Old], config: DetectConfig
+    field: Field,
+    changed: Sequence[Changed],
+    survey: Sequence[View],
+    olds: Sequence[Old],
+    configs: tuple[DetectConfig, HullConfig],
 ) -> list[Past]:
     """Render the new views without ``olds``; only rays that meet one are traced again."""
-    return [_look_past(field, c, survey, olds, config) for c in changed]
+    return [_look_past(field, c, survey, olds, configs) for c in changed]
 
 
-def _look_past(field: Field, c: Changed, survey: Sequence[View], olds: Sequence[Old], config: DetectConfig) -> Past:
-    view = c.view
+def _look_past(
+    field: Field,
+    c: Changed,
+    survey: Sequence[View],
+    olds: Sequence[Old],
+    configs: tuple[DetectConfig, HullConfig],
+) -> Past:
+    (config, carving), view = configs, c.view
     was = np.zeros(view.shape, bool)
     for old in olds:
         was |= pixels.dilate(silhouette(view, old), 2)
@@ -79,22 +89,22 @@ def _look_past(field: Field, c: Changed, survey: Sequence[View], olds: Sequence[
         rgb.reshape(-1, 3)[index] = seen.rgb.clamp(0, 1).numpy()
         depth.reshape(-1)[index] = seen.depth.numpy()
     hit = np.abs(np.where(np.isfinite(depth), depth, 0) - np.where(np.isfinite(view.depth), view.depth, 0))
-    gone = was & (hit > tolerance(view, np.where(np.isfinite(view.depth), view.depth, 0), HullConfig()))
+    gone = was & (hit > tolerance(view, np.where(np.isfinite(view.depth), view.depth, 0), carving))
     gone = pixels.close(gone, 3)
-    guess = was & ~(_seen_before(view, depth, survey) & ~_beneath(view, depth, olds))
+    guess = was & ~(_seen_before(view, depth, survey, carving) & ~_beneath(view, depth, olds))
     known = ~pixels.dilate(pixels.close(guess, 3), 1)
     sigma = blur_sigma(view, config)
     diff = pixels.colour_difference(pixels.blur(view.photo, sigma), pixels.blur(rgb, sigma), config.reach)
     return Past(c, rgb, depth, gone, known, diff, np.zeros(view.shape, bool), depth)
 
 
-def _seen_before(view: View, depth: Array, survey: Sequence[View]) -> Mask:
+def _seen_before(view: View, depth: Array, survey: Sequence[View], carving: HullConfig) -> Mask:
     """Pixels whose surface at ``depth`` some old view looks at."""
     with np.errstate(invalid="ignore"):
         points = (view.centre + view.directions * depth[..., None]).reshape(-1, 3)
     finite = np.all(np.isfinite(points), axis=-1)
     # an empty sky is known too: nothing was ever seen there
-    return (on_surface(points, survey, HullConfig()) | ~finite).reshape(view.shape)
+    return (on_surface(points, survey, carving) | ~finite).reshape(view.shape)
 
 
 def _beneath(view: View, depth: Array, olds: Sequence[Old]) -> Mask:

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from refield.estimate.correlated import pixels_as_one
 from refield.estimate.explain import explained
 from refield.estimate.layers import Crop, Layer, Layers, Sight, layers_at
 from refield.vision import pixels
@@ -22,6 +23,7 @@ FEW = 4
 ALL, COARSEST, FINER = slice(None), slice(0, 1), slice(1, None)
 """levels of the refinement"""
 
+_SURE = 1e-3  # of a colour; no picture is more exact
 _DARK = 0.02  # what is as dark as this says little about its light
 _BRIGHTER = 2.5  # times, at most, that the object may be at its new place
 _SIDE = 0.35  # of the radius; light on a side is even over this much when a pose is judged
@@ -206,6 +208,15 @@ def _blurred(image: Tensor, shape: tuple[int, int], sigma: float) -> Tensor:
     return torch.from_numpy(pixels.blur(image.reshape(*shape, 3).numpy(), sigma).reshape(-1, 3))
 
 
+def _variance(ready: Layers, at: Linear, c: RefineConfig) -> float:
+    """Of a pixel's colour error per channel, times how many pixels err as one."""
+    weight = at.weight / (1 + (at.error**2).sum(-1) / c.robust**2) ** 2
+    told = (at.error * weight.sqrt()[:, None]).split([len(crop.rays) for crop in ready.crops])
+    shared = pixels_as_one([e.reshape(*crop.shape, 3).numpy() for e, crop in zip(told, ready.crops)])
+    variance = float((at.error**2 * weight[:, None]).sum() / (3 * weight.sum()).clamp_min(1e-9))
+    return shared * (variance + _SURE**2)
+
+
 def _described(
     ready: Layers, pose: Tensor, hessian: Tensor, unit: Tensor, level: tuple[float, RefineConfig]
 ) -> PoseChange:
@@ -213,13 +224,11 @@ def _described(
     sigma, c = level
     now = residuals(ready, pose, sigma, c, slopes=False)
     size = (now.error**2).sum(-1).sqrt()[now.weight > 0.5]
-    noise = (float(size.median()) if len(size) else 1.0) * 1.2 + 1e-3
+    noise = (float(size.median()) if len(size) else 1.0) * 1.2 + _SURE
     values, vectors = torch.linalg.eigh(hessian)
     values = values.clamp_min(1e-9 * float(values.max().clamp_min(1e-9)))
     held = torch.linalg.eigvalsh(hessian[3:, 3:]) / torch.linalg.eigvalsh(hessian[:3, :3]).median().clamp_min(1e-9)
-    # neighbouring pixels share their error: about this many count as one
-    shared = 4 * np.pi * max(sigma, 0.5) ** 2 + 4
-    covariance = vectors @ torch.diag(noise**2 * shared / values) @ vectors.T
+    covariance = vectors @ torch.diag(_variance(ready, now, c) / values) @ vectors.T
     covariance = unit[:, None] * covariance * unit[None]
     free = int((held < c.unseen).sum())
     note = f"the photos do not show its turn about {'any axis' if free == 3 else f'{free} of 3 axes'}" if free else ""

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from refield.photos.database import Database
-from refield.photos.gather import Gathered, gather
+from refield.photos.gather import INDEX, Gathered, forget, gather
 from refield.photos.landmarks import NAME, Landmarks, landmarks_of, write_landmarks
-from refield.photos.motion import Counting, Motion, MotionConfig, reconstruct, silent
+from refield.photos.motion import Counting, Motion, MotionConfig, need_three, reconstruct, silent
 from refield.photos.taken import PhotoConfig
 from refield.scene.capture import Capture
 from refield.scene.errors import InputError
@@ -57,9 +57,15 @@ def capture_from_photos(
         InputError: too few photos can be used, or can be placed in one model.
     """
     count = counting or silent
+    new = not (cache / INDEX).exists()
     gathered = gather(folder, cache, config.photos, count("photos"))
     total = len(gathered.photos) + len(gathered.left_out)
-    _enough(folder, gathered, total)
+    try:
+        _enough(folder, gathered, total)
+    except InputError:
+        if new:
+            forget(cache)
+        raise
     with Database.opened(cache, config.motion.features, warn) as database:
         motion = reconstruct(gathered.photos, database, config.motion, count)
         by_name = {photo.name: photo for photo in gathered.photos}
@@ -76,6 +82,7 @@ def _enough(folder: Path, gathered: Gathered, total: int) -> None:
         reasons = named([f"{name} {why}" for name, why in gathered.left_out])
         what = f"{len(gathered.left_out)} of its {total} photos cannot be used ({reasons})"
         raise InputError(folder, what, "replace them")
+    need_three(folder, len(gathered.photos))
 
 
 def _tell(folder: Path, motion: Motion, left_out: tuple[tuple[str, str], ...], warn: Warn) -> None:

@@ -7,6 +7,7 @@ Nothing here changes the folder that was given.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -61,6 +62,12 @@ def gather(
         if on_progress is not None:
             on_progress(i + 1, len(sources))
     return _sorted_out(cache, records, among)
+
+
+def forget(cache: Path) -> None:
+    """Remove what `gather` made."""
+    shutil.rmtree(cache / FOLDER, ignore_errors=True)
+    (cache / INDEX).unlink(missing_ok=True)
 
 
 def _read_index(cache: Path, config: PhotoConfig) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -67,6 +68,13 @@ class Motion:
     """photos in each separate model, the largest first"""
 
 
+def need_three(what: Path | str, count: int) -> None:
+    """Raises InputError: from so few photos nobody can tell where they were taken."""
+    if count < 3:
+        fault = f"{count} photos are too few to find where they were taken"
+        raise InputError(what, fault, "give 50 or more, from many sides")
+
+
 def reconstruct(
     photos: Sequence[Taken], database: Database, config: MotionConfig, counting: Counting | None = None
 ) -> Motion:
@@ -75,9 +83,7 @@ def reconstruct(
     Raises:
         InputError: too few photos, or too few of them that belong together.
     """
-    if len(photos) < 3:
-        what = f"{len(photos)} photos are too few to find where they were taken"
-        raise InputError("photos", what, "give 50 or more, from many sides")
+    need_three("photos", len(photos))
     count = counting or silent
     database.set_cameras(photos, first_cameras(photos))
     database.add_features(photos, count("features"))

@@ -18,6 +18,7 @@ from refield.scene.change import ObjectChange, PlacedPhoto, SceneChange
 from refield.scene.pose import rotation_log, skew, transform
 from refield.scene.world import World
 
+_CENTRE = 1 / math.sqrt(24)  # of a cell: of the mean of two that lie anywhere in one
 _VERSIONS_OF = ("refield", "torch", "numpy", "numba", "opencv-python-headless", "pycolmap")
 
 
@@ -87,32 +88,25 @@ def turn(new_from_old: Tensor) -> tuple[float, list[float]]:
 
 
 def object_shift(change: ObjectChange) -> list[float] | None:
-    """How far a moved object's centre went, (3,) world units.
-
-    Unlike T's own last column it does not depend on where the world's origin lies.
-    """
-    if change.new_from_old is None:
-        return None
-    centre = _centre(change)
-    return (transform(change.new_from_old.double(), centre) - centre).tolist()
-
-
-def _centre(change: ObjectChange) -> Tensor:
-    """Of the grid's occupied part, (3,) float64, world."""
-    return change.grid.tight_aabb().mean(0).double()
+    """`ObjectChange.shift` as plain numbers."""
+    return None if change.shift is None else change.shift.tolist()
 
 
 def uncertainty(change: ObjectChange) -> tuple[float, float] | None:
-    """Standard deviations of a pose change: of the object's centre (world units) and of the turn (degrees).
+    """Standard deviations of a pose change: of the centre's shift (world units) and of the turn (degrees).
 
-    Each is the root of the summed variances along the three axes.
+    Each is the root of the summed variances along the three axes. How far the centre of a thing that turned went
+    depends on where in it the centre is, and that is known no better than the grid is fine: each of two opposite sides
+    may lie anywhere in a cell.
     """
     if change.covariance is None or change.new_from_old is None:
         return None
     cov = change.covariance.double()
-    centre = transform(change.new_from_old.double(), _centre(change))
+    centre = transform(change.new_from_old.double(), change.centre)
     lever = torch.cat([torch.eye(3, dtype=cov.dtype), -skew(centre)], 1)  # d centre / d twist
-    spread = float((lever @ cov @ lever.T).trace().clamp_min(0).sqrt())
+    turned = change.new_from_old[:3, :3].double() - torch.eye(3, dtype=cov.dtype)  # d shift / d centre
+    where = turned @ torch.diag((_CENTRE * change.grid.cell.double()).square()) @ turned.T
+    spread = float(((lever @ cov @ lever.T).trace().clamp_min(0) + where.trace()).sqrt())
     return spread, math.degrees(float(cov[3:, 3:].trace().clamp_min(0).sqrt()))
 
 

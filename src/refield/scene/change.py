@@ -54,6 +54,17 @@ class OccupancyGrid:
         """World positions of the nodes inside the object, (K, 3) float32."""
         return self.nodes()[self.values > 0.5]
 
+    @cached_property
+    def centre(self) -> Tensor:
+        """Mean of the occupied nodes, (3,) float64, world; the middle of the grid's own box if none is."""
+        points = self.occupied()
+        return (points if len(points) else self.aabb).double().mean(0)
+
+    @property
+    def cell(self) -> Tensor:
+        """(3,) float32 distance of neighbouring nodes along each axis, world units."""
+        return (self.aabb[1] - self.aabb[0]) / (torch.tensor(self.values.shape) - 1)
+
     def tight_aabb(self) -> Tensor:
         """(2, 3) box around the occupied nodes, half a cell wider; the grid's own box if none is occupied."""
         return self._tight
@@ -131,6 +142,22 @@ class ObjectChange:
         if self.new_from_old is None:
             raise ValueError(f"an object that was {self.kind} has no pose change")
         return invert(self.new_from_old)
+
+    @property
+    def centre(self) -> Tensor:
+        """The mean of the grid's occupied part, (3,) float64, world: wherever a place of the object is told, it is that
+        of this point, and a move's length is how far it went."""
+        return self.grid.centre
+
+    @property
+    def shift(self) -> Tensor | None:
+        """How far a moved object's centre went, (3,) float64, world units.
+
+        Unlike T's own last column it does not depend on where the world's origin lies.
+        """
+        if self.new_from_old is None:
+            return None
+        return transform(self.new_from_old.double(), self.centre) - self.centre
 
     @property
     def grid_now(self) -> OccupancyGrid | None:

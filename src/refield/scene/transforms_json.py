@@ -102,7 +102,12 @@ def save_transforms(path: Path, capture: Capture) -> None:
 
 def stem(frame: Frame) -> str:
     """The name a picture of this view is written under: the file's name without an image suffix."""
-    name = PurePosixPath(frame.name.replace("\\", "/")).name
+    return stem_of(frame.name)
+
+
+def stem_of(name: str) -> str:
+    """The same of a photo's name."""
+    name = PurePosixPath(name.replace("\\", "/")).name
     known = (*images.SUFFIXES, ".exr", ".hdr", ".heic", ".heif", ".hif", ".avif", ".gif")
     return name[: -len(PurePosixPath(name).suffix)] if name.lower().endswith(known) else name
 

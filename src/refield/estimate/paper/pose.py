@@ -136,9 +136,3 @@ def matched_pixels(matches: Sequence[Matches]) -> list[tuple[View, Mask]]:
         _, mask = found.setdefault(m.came.frame.name, (m.came, np.zeros(m.came.shape, bool)))
         mask[m.uv[:, 1].astype(int), m.uv[:, 0].astype(int)] = True
     return list(found.values())
-
-
-def shift_of(new_from_old: Tensor, centre: Array) -> float:
-    """How far T carries an object's centre (3,), world units."""
-    c = torch.from_numpy(centre).double()
-    return float((transform(new_from_old, c) - c).norm())

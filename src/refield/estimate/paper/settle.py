@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from refield.estimate.detect import Mask
 from refield.estimate.look import Array, View
@@ -15,7 +14,7 @@ from refield.estimate.paper import segment
 from refield.estimate.paper.associate import Partners, Sighting, Thing
 from refield.estimate.paper.config import PaperConfig
 from refield.estimate.paper.newcomer import newcomer_grid
-from refield.estimate.paper.pose import MatchedPose, landing, matched_pixels, matched_pose, shift_of
+from refield.estimate.paper.pose import MatchedPose, landing, matched_pixels, matched_pose
 from refield.estimate.paper.refine import Refined, interest, refine
 from refield.estimate.paper.segment import OldMask
 from refield.estimate.segment import masks_in
@@ -108,7 +107,7 @@ def _segmented(scene: Scene, s: Settled, asked: Sequence[OldMask], grid: Occupan
     pose = s.refined.new_from_old
     now = masks_in(scene.frames, grid.moved(pose))
     change = ObjectChange("moved", grid, pose, masks, now, confidence=confidence * s.matched.share, note=note)
-    return Outcome(s, change, _why_moved(s.cloud, s.matched, pose))
+    return Outcome(s, change, _why_moved(change, s.matched))
 
 
 def _arrived(scene: Scene, s: Settled) -> Outcome:
@@ -135,11 +134,12 @@ def _score(s: Settled) -> float:
     return sum(scores) / len(scores)
 
 
-def _why_moved(cloud: Array, matched: MatchedPose, pose: Tensor) -> str:
-    turn = float(angle_between(pose, torch.eye(4, dtype=torch.float64)))
-    shift = shift_of(pose, cloud.mean(0))
+def _why_moved(moved: ObjectChange, matched: MatchedPose) -> str:
+    assert moved.new_from_old is not None and moved.shift is not None
+    turn = float(angle_between(moved.new_from_old, torch.eye(4, dtype=torch.float64)))
+    shift = float(moved.shift.norm())
     agree = f"{matched.inliers} matched features ({100 * matched.share:.0f} %) agree"
-    return f"1 moved by {shift:.3g} and turned by {turn:.0f} degrees: {agree}"
+    return f"1 moved by {shift:.4g} and turned by {turn:.0f} degrees: {agree}"
 
 
 def _sightings(thing: Thing | None) -> tuple[Sighting, ...]:
