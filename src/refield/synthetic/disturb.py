@@ -46,11 +46,11 @@ class Disturbance:
     """pixels, standard deviation of a Gaussian"""
     pose_px: float = 0.0
     """pixels, root mean square over the picture by which a wrong pose displaces points at the scene's distance"""
-    vignetting: float = 0.0
-    """part of the light lost in the corners, in every photo the same; it falls with the square of the radius"""
     jpeg: int | None = None
     """quality, 1 to 100; the picture is compressed once, and stored as it looks then"""
     seed: int = 0
+    vignetting: float = 0.0
+    """part of the light lost in the corners, in every photo the same; it falls with the square of the radius"""
 
     def __post_init__(self) -> None:
         for field in fields(self):
