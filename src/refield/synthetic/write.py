@@ -30,6 +30,8 @@ from refield.synthetic.worlds import WORLDS
 
 Progress = Callable[[int, int], None]
 """Called with the pictures done and their number."""
+Shown = Callable[[State, str, Frame], Tensor]
+"""Which pixels of a photo show the named item in a state, (H, W) bool."""
 
 
 @dataclass(frozen=True)
@@ -122,28 +124,41 @@ def shoot_state(
     return capture
 
 
-def true_change(world: World, before: Capture, frames: Sequence[Frame]) -> SceneChange:
+def silhouette_in(state: State, name: str, frame: Frame) -> Tensor:
+    """Pixels of a photo that show the named item of a world, where there is nothing else: the `Shown` of worlds."""
+    return silhouette(state, name, frame.camera, frame.world_from_cam)
+
+
+def true_change(
+    world: World, before: Capture, frames: Sequence[Frame], shown: Shown = silhouette_in
+) -> SceneChange:
     """What `estimate` should find: masks as in ``before.train``, and the new photos all used."""
+    seen = [masks_of(world, frame, shown) for frame in frames]
     return SceneChange(
-        objects=tuple(_object_change(world, change, before.train) for change in world.changes),
+        objects=tuple(_object_change(world, change, before.train, shown) for change in world.changes),
         photos=tuple(PlacedPhoto(frame.name, "used", frame=frame) for frame in frames),
         why="known from the world's description",
-        masks_in=tuple(masks(world, f.camera, f.world_from_cam)[0] for f in frames),
-        masks_out=tuple(masks(world, f.camera, f.world_from_cam)[1] for f in frames),
+        masks_in=tuple(now for now, _ in seen),
+        masks_out=tuple(then for _, then in seen),
     )
 
 
 def masks(world: World, camera: Camera, world_from_cam: Tensor) -> tuple[Tensor, Tensor]:
     """Move-in (what arrived, visible now) and move-out (what was there, visible then), (H, W) bool each."""
-    none = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    now = [silhouette(world.after, c.new.name, camera, world_from_cam) for c in world.changes if c.new]
-    then = [silhouette(world.before, c.old.name, camera, world_from_cam) for c in world.changes if c.old]
+    return masks_of(world, Frame(Path(), camera, "", world_from_cam), silhouette_in)
+
+
+def masks_of(world: World, frame: Frame, shown: Shown) -> tuple[Tensor, Tensor]:
+    """`masks` of a photo."""
+    none = torch.zeros(frame.camera.height, frame.camera.width, dtype=torch.bool)
+    now = [shown(world.after, c.new.name, frame) for c in world.changes if c.new]
+    then = [shown(world.before, c.old.name, frame) for c in world.changes if c.old]
     return reduce(torch.logical_or, now, none), reduce(torch.logical_or, then, none)
 
 
-def _object_change(world: World, change: TrueChange, frames: Sequence[Frame]) -> ObjectChange:
+def _object_change(world: World, change: TrueChange, frames: Sequence[Frame], shown: Shown) -> ObjectChange:
     def seen(state: State, name: str) -> tuple[Tensor, ...]:
-        return tuple(silhouette(state, name, f.camera, f.world_from_cam) for f in frames)
+        return tuple(shown(state, name, f) for f in frames)
 
     item = change.old or change.new
     assert item is not None  # a change has one side at least
