@@ -1,4 +1,5 @@
-"""What real photos suffer and rendered ones do not: exposure, colour cast, noise, blur, JPEG, a pose a little off.
+"""What real photos suffer and rendered ones do not: exposure, colour cast, vignetting, noise, blur,
+JPEG, a pose a little off.
 
 Each photo and each effect has its own random stream, so an effect that is switched on changes no other.
 """
@@ -45,6 +46,8 @@ class Disturbance:
     """pixels, standard deviation of a Gaussian"""
     pose_px: float = 0.0
     """pixels, root mean square over the picture by which a wrong pose displaces points at the scene's distance"""
+    vignetting: float = 0.0
+    """part of the light lost in the corners, in every photo the same; it falls with the square of the radius"""
     jpeg: int | None = None
     """quality, 1 to 100; the picture is compressed once, and stored as it looks then"""
     seed: int = 0
@@ -54,6 +57,8 @@ class Disturbance:
             value = getattr(self, field.name)
             if value is not None and value < 0:
                 raise InputError(field.name, f"is {value}", "give 0 or more")
+        if self.vignetting > 1:
+            raise InputError("vignetting", f"is {self.vignetting}", "give at most 1")
         if self.jpeg is not None and not 1 <= self.jpeg <= 100:
             raise InputError("jpeg", f"is {self.jpeg}", "give a quality from 1 to 100")
 
@@ -87,7 +92,7 @@ def disturbed_photo(image: Tensor, disturbance: Disturbance, name: str) -> Tenso
     light = to_linear(image.numpy().astype(np.float32) / np.float32(255))
     if disturbance.blur > 0:
         light = blurred(light, disturbance.blur)
-    light = light * gains(disturbance, name)
+    light = light * gains(disturbance, name) * falloff(disturbance, image.shape[0], image.shape[1])
     light = light + _sensor_noise(light, disturbance, _stream(disturbance, "noise", name))
     pixels = np.rint(to_srgb(light) * 255).astype(np.uint8)  # what is too bright is clipped here
     return torch.from_numpy(pixels if disturbance.jpeg is None else _compressed(pixels, disturbance.jpeg))
@@ -98,6 +103,13 @@ def gains(disturbance: Disturbance, name: str) -> NDArray[np.float32]:
     stops = disturbance.exposure * _stream(disturbance, "exposure", name).normal()
     cast = disturbance.white_balance * _stream(disturbance, "white_balance", name).normal(size=3)
     return (2.0**stops * np.exp(cast - cast.mean())).astype(np.float32)
+
+
+def falloff(disturbance: Disturbance, height: int, width: int) -> NDArray[np.float32]:
+    """(H, W, 1) part of the light that reaches each pixel: 1 in the middle, 1 - ``vignetting`` in the corners."""
+    v, u = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (height, width))
+    squared = (height * v[:, None]) ** 2 + (width * u[None]) ** 2
+    return (1 - disturbance.vignetting * squared / (height**2 + width**2))[..., None].astype(np.float32)
 
 
 def disturbed_pose(frame: Frame, disturbance: Disturbance, distance: float) -> Tensor:

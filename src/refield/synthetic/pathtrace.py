@@ -13,7 +13,7 @@ from torch import Tensor
 
 from refield.scene.camera import Camera
 from refield.scene.errors import InputError
-from refield.synthetic.state import Item, State
+from refield.synthetic.state import Item, Lamp, State
 from refield.synthetic.textures import to_linear, to_srgb
 
 _OLDEST_LLVM = 19  # an older one aborts the whole process on the first kernel
@@ -71,7 +71,17 @@ def _scene(mi: Any, state: State) -> dict[str, Any]:
     if state.sun is not None:
         light = {"type": "rgb", "value": list(state.sun)}
         out["sun"] = {"type": "directional", "direction": list(state.sun_direction), "irradiance": light}
+    out |= {f"lamp_{i}": _lamp(mi, lamp) for i, lamp in enumerate(state.lamps)}
     return out | {f"item_{i}": _mesh(mi, item) for i, item in enumerate(state.items)}
+
+
+def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
+    light = {"type": "rgb", "value": list(lamp.light)}
+    if lamp.half is None:
+        return {"type": "point", "position": list(lamp.at), "intensity": light}
+    # a rectangle shines along +z
+    down = mi.ScalarTransform4f().translate(list(lamp.at)).rotate([1, 0, 0], 180).scale([*lamp.half, 1])
+    return {"type": "rectangle", "to_world": down, "emitter": {"type": "area", "radiance": light}}
 
 
 def _mesh(mi: Any, item: Item) -> Any:

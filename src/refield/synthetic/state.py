@@ -70,6 +70,17 @@ class Item:
 
 
 @dataclass(frozen=True)
+class Lamp:
+    """A light in a room: a panel that shines downwards, or a bulb that throws sharp shadows."""
+
+    at: Triple
+    light: Triple
+    """Linear RGB: a panel's radiance, a bulb's intensity"""
+    half: tuple[float, float] | None = None
+    """Half the panel's sides, metres; None = a bulb, itself not seen"""
+
+
+@dataclass(frozen=True)
 class State:
     """Everything in the scene at one time; the first item is the floor."""
 
@@ -80,6 +91,20 @@ class State:
     """Irradiance of a hard light, linear RGB; None = the surroundings alone"""
     sun_direction: Triple = (-0.55, 0.45, -0.7)
     """The way the hard light travels"""
+    lamps: tuple[Lamp, ...] = ()
+
+    def brightened(self, factor: float) -> State:
+        """The same state under so many times as much light."""
+
+        def more(light: Triple) -> Triple:
+            return (factor * light[0], factor * light[1], factor * light[2])
+
+        return replace(
+            self,
+            surroundings=(factor * self.surroundings).astype(np.float32),
+            sun=None if self.sun is None else more(self.sun),
+            lamps=tuple(replace(lamp, light=more(lamp.light)) for lamp in self.lamps),
+        )
 
     def named(self, name: str) -> Item | None:
         return next((item for item in self.items if item.name == name), None)

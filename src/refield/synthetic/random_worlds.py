@@ -1,0 +1,162 @@
+"""A world drawn at random: every choice comes from the seed.
+
+A place, its light and a camera path are drawn first; then objects and their changes, anew until nothing stands in
+anything else and the photos show every change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from refield.scene.camera import Camera
+from refield.synthetic.disturb import Disturbance
+from refield.synthetic.random_light import Light, lamps, sky, studio
+from refield.synthetic.random_objects import FAMILIES
+from refield.synthetic.random_paths import CameraPath, draw_camera, draw_path
+from refield.synthetic.random_places import Place, draw_place, in_room
+from refield.synthetic.random_scenes import Thing, draw_change, draw_things
+from refield.synthetic.random_views import Views, seen_by
+from refield.synthetic.state import State, World
+
+NEW = 4
+"""new photos, and as many for evaluation"""
+_LEAST, _MOST = 30, 120  # old photos
+_TESTED = 16  # old views that a draw is judged by
+_SCENES, _PLACES = 25, 40  # draws of objects in one place; draws of places
+
+
+@dataclass(frozen=True)
+class RandomWorld:
+    """A world with the cameras that see it."""
+
+    world: World
+    camera: Camera
+    """1200 pixels at its longer side, to be scaled"""
+    old: tuple[Tensor, ...]
+    """world_from_cam (4, 4) float64 each, as the next two"""
+    new: tuple[Tensor, ...]
+    evaluation: tuple[Tensor, ...]
+    disturbance: Disturbance | None
+    """of old and new photos"""
+    brightness: float
+    """mean of the photos that the light is to be scaled to, sRGB in [0, 1]"""
+    facts: dict[str, Any]
+    """all that was chosen, for ``world.json``"""
+
+
+def random_world(seed: int, photos: int | None = None) -> RandomWorld:
+    """The world of a seed; ``photos`` old ones, or as many as the seed says.
+
+    Raises:
+        RuntimeError: nothing was found in a great many draws.
+    """
+    rng = np.random.default_rng([seed, *b"random"])
+    count, brightness = int(rng.integers(_LEAST, _MOST + 1)), float(rng.uniform(0.36, 0.48))
+    disturbance = _disturbance(rng, seed)
+    for _ in range(_PLACES):
+        frame = _frame(rng)
+        found = _scene(rng, frame)
+        if found is not None:
+            break
+    else:
+        raise RuntimeError(f"seed {seed}: no world in {_PLACES} places")
+    place, light, camera, path, views = frame
+    things, changes, before, after, seen = found
+    world = World("random", before, after, place.target)
+    old = path.poses(np.random.default_rng([seed, *b"path"]), photos or count)
+    facts = {
+        "seed": seed,
+        "place": place.family,
+        "setting": "room" if light.lamps else "studio" if light.family == "studio" else "outdoors",
+        "ground": place.ground,
+        "light": light.family,
+        "path": path.family,
+        "field_of_view_deg": round(float(2 * np.rad2deg(np.arctan(600 / camera.fx))), 1),
+        "aspect": round(camera.width / camera.height, 3),
+        "photos": len(old),
+        "brightness": round(brightness, 3),
+        "disturbance": None if disturbance is None else asdict(disturbance),
+        "changes": sorted({kind for kind in changes.values() if kind != "none"}),
+        "objects": [_told(thing, changes[thing.item.name], seen) for thing in things],
+    }
+    new = (tuple(views.new), tuple(views.evaluation))
+    return RandomWorld(world, camera, tuple(old), *new, disturbance, brightness, facts)
+
+
+_Frame = tuple[Place, Light, Camera, CameraPath, Views]
+_Scene = tuple[Sequence[Thing], dict[str, str], State, State, dict[str, dict[str, float]]]
+
+
+def _frame(rng: np.random.Generator) -> _Frame:
+    """Where it is, in which light, and from where it is seen."""
+    setting = str(rng.choice(["room", "studio", "outdoors"], p=[0.4, 0.15, 0.45]))
+    place, camera = draw_place(rng, outdoors=setting == "outdoors"), draw_camera(rng)
+    path = draw_path(rng, place, camera)
+    views = Views(
+        camera, path.poses(rng, _TESTED), path.new_poses(rng, NEW), path.new_poses(rng, NEW), path.distance
+    )
+    eyes = np.stack([pose[:3, 3].numpy() for pose in views.all])
+    if setting == "room":
+        wide = float(np.abs(eyes[:, :2]).max()) + float(rng.uniform(0.3, 1.0))
+        wide = max(wide, 2.0 * place.reach)
+        high = max(float(eyes[:, 2].max()) + 0.4, 2.2, place.target[2] + 1.5 * place.reach)
+        return in_room(rng, place, wide, high), lamps(rng, place, wide, high), camera, path, views
+    return place, sky(rng) if setting == "outdoors" else studio(rng), camera, path, views
+
+
+def _scene(rng: np.random.Generator, frame: _Frame) -> _Scene | None:
+    """Objects and changes that fit and are seen; None after many draws."""
+    place, light, _, _, views = frame
+    empty = State(place.items, light.surroundings)
+    fixed = views.depths(empty)
+    if not views.clear(fixed):
+        return None
+    for _ in range(_SCENES):
+        things = draw_things(rng, place)
+        if things is None:
+            continue
+        drawn = draw_change(rng, place, things)
+        if drawn is None:
+            continue
+        before, after = (light.on(replace(empty, items=(*place.items, *items))) for items in (drawn.before, drawn.after))
+        seen = seen_by(views, fixed, drawn)
+        if seen is not None:
+            return drawn.things, drawn.kinds, before, after, seen
+    return None
+
+
+def _told(thing: Thing, kind: str, seen: dict[str, dict[str, float]]) -> dict[str, Any]:
+    assert thing.family in FAMILIES
+    size = 2 * float(np.sqrt(np.mean(np.square(thing.item.solid.half))))
+    return {
+        "name": thing.item.name,
+        "family": thing.family,
+        "texture": thing.pattern,
+        "size": round(size, 3),
+        "change": kind,
+        **{key: round(value, 4) for key, value in seen[thing.item.name].items()},
+    }
+
+
+def _disturbance(rng: np.random.Generator, seed: int) -> Disturbance | None:
+    """As a phone's photos are; none at all for a fifth of the seeds."""
+    none = bool(rng.random() < 0.2)
+    strong = rng.uniform(0, 1, 6)
+    quality = [None, None, 95, 90, 80][int(rng.integers(5))]
+    if none:
+        return None
+    return Disturbance(
+        exposure=round(float(0.25 * strong[0]), 3),
+        white_balance=round(float(0.05 * strong[1]), 3),
+        noise=round(float(0.025 * strong[2]), 4),
+        blur=round(float(0.8 * strong[3]), 3) if strong[3] > 0.4 else 0.0,
+        pose_px=round(float(0.5 * strong[4]), 3),
+        vignetting=round(float(0.3 * strong[5]), 3),
+        jpeg=quality,
+        seed=seed,
+    )
