@@ -13,7 +13,7 @@ from torch import Tensor
 
 from refield.field.radiance import Field
 from refield.rehearse.plan import Plan, plan_of
-from refield.rehearse.spots import Site, site_of
+from refield.rehearse.spots import sites_of
 from refield.rehearse.surfaces import Standing, Surfaces, View, depth_in, surfaces_of
 from refield.scene.capture import Capture, Frame
 from refield.scene.change_files import save_change
@@ -100,9 +100,8 @@ def compose(scenery: Scenery, out: Path, seed: int, on_progress: Count | None = 
         return [views[id(frame)] for frame in frames]
 
     groups = (group(photos.before), group(photos.after), group(photos.evaluation))
-    site = site_of(surfaces, scenery.up, groups, seed)
-    plan = plan_of(site, seed)
-    studio = _Studio(scenery, site, plan)
+    plan = plan_of(sites_of(surfaces, scenery.up, groups, seed), seed)
+    studio = _Studio(scenery, plan)
     world, total, done = plan.world, len(scenery.capture.frames), 0
     captures = {}
     for folder, frames, state in (
@@ -129,10 +128,9 @@ def _size(captures: dict[str, Capture]) -> dict[str, Any]:
 class _Studio:
     """Puts a plan's objects into photos, and remembers what each shows of which."""
 
-    def __init__(self, scenery: Scenery, site: Site, plan: Plan) -> None:
-        self._scenery, self._plan = scenery, plan
-        self._standing = None
-        plane = None
+    def __init__(self, scenery: Scenery, plan: Plan) -> None:
+        self._scenery, self._plan, site = scenery, plan, plan.site
+        self._standing, plane = None, None
         if site.offset is not None:
             self._standing = Standing(site.up, site.offset, 2 * site.even)
             plane = (site.up, site.offset, 2 * site.even)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,8 @@ from torch import Tensor
 from refield.rehearse.spots import Site, is_free, pose_at, upright
 from refield.scene.errors import InputError
 from refield.scene.pose import exp
-from refield.synthetic.placing import box_item, round_item
+from refield.synthetic.random_objects import drawn_item, round_about_z
 from refield.synthetic.shading import Light
-from refield.synthetic.shapes import Cone, Cylinder, Sphere
 from refield.synthetic.state import Item, State, World
 from refield.synthetic.textures import to_linear
 
@@ -25,7 +24,7 @@ HAPPENINGS = ("moved", "added", "removed", "several", "turned", "tipped", "nothi
 LARGEST, SMALLEST = 0.35, 0.10
 """of the picture's shorter side at that distance"""
 _TRIES = 60
-_SHRINK = 0.85
+_SHRINK, _LEAST = 0.85, 0.9
 _LEAST_TURN, _MOST_TURN = 20.0, 180.0  # degrees
 _MEAN_ALBEDO = 0.3
 _WHITEST = 0.8
@@ -36,6 +35,7 @@ class Plan:
     """A rehearsal before it is photographed."""
 
     world: World
+    site: Site
     light: Light
     facts: dict[str, Any]
 
@@ -47,6 +47,15 @@ class _Stage:
     site: Site
     rng: np.random.Generator
     taken: list[tuple[NDArray[np.float64], float]]
+    families: dict[str, str] = field(default_factory=dict)
+
+    def drawn(self, name: str, size: float, doing: str) -> Item:
+        """A random object; one that is to be turned is not round."""
+        while True:
+            item, family, _ = drawn_item(self.rng, name, size / 3**0.5 * self.rng.uniform(1.1, 1.5))
+            if doing != "turned" or not round_about_z(item.solid):
+                self.families[name] = family
+                return item
 
     def place(self, item: Item, near: Tensor | None = None, tip: Tensor | None = None) -> Item | None:
         """The item at a free spot, by preference close to the place ``near``; None where it finds no room."""
@@ -55,38 +64,35 @@ class _Stage:
         if near is not None:
             away = np.linalg.norm(spots - near.numpy(), axis=-1)
             order = order[np.argsort(away[order] > 5 * max(item.solid.half), kind="stable")]
+        vertices = torch.from_numpy(item.solid.mesh()[0]).double()
         for k in order[:_TRIES].tolist():
-            stood = self._stand(item, spots[k], self.rng.uniform(0, 360), tip)
-            radius, height = _extent(stood, self.site.up)
+            turn = upright(self.site, self.rng.uniform(0, 360))
+            turn = turn if tip is None else turn @ tip
+            radius, height, lowest = _extent(vertices @ turn.T, self.site.up)
             apart = all(np.linalg.norm(spots[k] - at) > 1.1 * (radius + r) for at, r in self.taken)
             if apart and is_free(self.site, spots[k], radius, height):
                 self.taken.append((spots[k], radius))
-                return stood
+                return replace(item, world_from_item=pose_at(self.site, spots[k], turn, -lowest))
         return None
 
-    def _stand(self, item: Item, spot: NDArray[np.float64], degrees: float, tip: Tensor | None) -> Item:
-        turn = upright(self.site, degrees) @ (torch.eye(3, dtype=torch.float64) if tip is None else tip)
-        vertices = torch.from_numpy(item.solid.mesh()[0]).double() @ turn.T @ self.site.up
-        return replace(item, world_from_item=pose_at(self.site, spot, turn, -float(vertices.min())))
 
-
-def plan_of(site: Site, seed: int) -> Plan:
-    """A random rehearsal at a site.
+def plan_of(sites: Sequence[Site], seed: int) -> Plan:
+    """A random rehearsal at the first of the sites that has room for it.
 
     Raises:
         InputError: there is no place that enough photos see, or no free one.
     """
     rng = np.random.default_rng([seed, 11])
-    happening = HAPPENINGS[seed % len(HAPPENINGS)]
-    size = site.width * rng.uniform(SMALLEST, LARGEST)
-    while len(site.centres) and size >= 0.9 * SMALLEST * site.width:
-        tried = np.random.default_rng([seed, 13, int(1e6 * size / site.width)])
-        stage = _Stage(site, tried, [])
-        world = _enacted(stage, happening, size)
-        if world is not None:
-            light = _light(rng, site, world)
-            return Plan(world, light, _facts(seed, happening, world, site, light))
-        size *= _SHRINK
+    happening, part = HAPPENINGS[seed % len(HAPPENINGS)], float(rng.uniform(SMALLEST, LARGEST))
+    for site in sites:
+        smaller = part
+        while len(site.centres) and smaller >= _LEAST * SMALLEST:
+            stage = _Stage(site, np.random.default_rng([seed, 13]), [])
+            world = _enacted(stage, happening, smaller * site.width)
+            if world is not None:
+                light = _light(rng, site, world)
+                return Plan(world, site, light, _facts(seed, happening, stage, world, light))
+            smaller *= _SHRINK
     what = "there is no free place in it that a third of the photos and three of the four new ones show"
     raise InputError("the rehearsal", what, "photos that look at one place from many sides are needed")
 
@@ -102,7 +108,7 @@ def _enacted(stage: _Stage, happening: str, size: float) -> World | None:
     before: list[Item] = []
     after: list[Item] = []
     for k, doing in enumerate(doings + ["nothing"] * (bystanders - (happening == "nothing"))):
-        item = stage.place(random_object(rng, f"object {k}", size * rng.uniform(0.9, 1.2)))
+        item = stage.place(stage.drawn(f"object {k}", size, doing))
         if item is None:
             return None
         now: Item | None = item
@@ -140,25 +146,11 @@ def _twist(axis: Tensor, degrees: float) -> Tensor:
     return exp(torch.cat([torch.zeros(3, dtype=torch.float64), axis * np.deg2rad(degrees)]))[:3, :3]
 
 
-def random_object(rng: np.random.Generator, name: str, size: float) -> Item:
-    """A painted box or a round solid whose largest side is ``size``, at the origin."""
-    hue, sides = float(rng.random()), size / 2 * rng.uniform(0.7, 1.0, 3)
-    kind = str(rng.choice(["box", "cylinder", "cone", "sphere"]))
-    if kind == "box":
-        return box_item(rng, name, (sides[0], sides[1], sides[2]), hue, (0.0, 0.0, 0.0))
-    solid = {
-        "cylinder": Cylinder(sides[0], 2 * sides[2]),
-        "cone": Cone(sides[0], 2 * sides[2]),
-        "sphere": Sphere(sides[0]),
-    }[kind]
-    return round_item(rng, name, solid, hue, (0.0, 0.0, 0.0))
-
-
-def _extent(item: Item, up: Tensor) -> tuple[float, float]:
-    """How far an item reaches from its middle across ``up``, and how high it is."""
-    vertices = torch.from_numpy(item.solid.mesh()[0]).double() @ item.world_from_item[:3, :3].T
+def _extent(vertices: Tensor, up: Tensor) -> tuple[float, float, float]:
+    """How far points (V, 3) reach across ``up``, how high they are, and where along it they begin."""
     along = vertices @ up
-    return float((vertices - along[:, None] * up).norm(dim=-1).max()), float(along.max() - along.min())
+    beside = (vertices - along[:, None] * up).norm(dim=-1)
+    return float(beside.max()), float(along.max() - along.min()), float(along.min())
 
 
 def _light(rng: np.random.Generator, site: Site, world: World) -> Light:
@@ -178,9 +170,10 @@ def _light(rng: np.random.Generator, site: Site, world: World) -> Light:
     return Light(site.up, sun / sun.norm(), float(rng.uniform(0.25, 0.55)), float(rng.uniform(0.1, 0.3)), radiance)
 
 
-def _facts(seed: int, happening: str, world: World, site: Site, light: Light) -> dict[str, Any]:
+def _facts(seed: int, happening: str, stage: _Stage, world: World, light: Light) -> dict[str, Any]:
+    site = stage.site
     items = {item.name: item for item in (*world.before.items, *world.after.items)}
-    changed = {(c.old or c.new or next(iter(items.values()))).name: c.kind for c in world.changes}
+    kinds = {item.name: c.kind for c in world.changes for item in (c.old, c.new) if item is not None}
     return {
         "seed": seed,
         "happening": happening,
@@ -188,10 +181,10 @@ def _facts(seed: int, happening: str, world: World, site: Site, light: Light) ->
         "objects": [
             {
                 "name": name,
-                "family": type(item.solid).__name__,
+                "family": stage.families[name],
                 "size": 2 * max(item.solid.half),
                 "part_of_picture": 2 * max(item.solid.half) / site.width,
-                "change": changed.get(name, "none"),
+                "change": kinds.get(name),
             }
             for name, item in items.items()
         ],

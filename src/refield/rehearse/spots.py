@@ -17,6 +17,7 @@ _FEWEST_OLD = 1 / 3
 """of the old photos see a spot"""
 _MISSED_NEW = 1
 """of the new photos, at most, does not"""
+_INSET = 0.1  # of a picture's sides: a spot nearer to the border does not count as seen
 _SPARE = 1.15  # of an object's size is kept free
 _DUST = 0.02  # of the points over a spot may be the field's noise
 
@@ -42,14 +43,17 @@ class Site:
         return self.offset is None
 
 
-def site_of(surfaces: Surfaces, up: Tensor, groups: tuple[list[View], list[View], list[View]], seed: int) -> Site:
-    """The plane with the most spots that the ``groups`` of photos (before, after, eval) see well; else the air."""
+Groups = tuple[list[View], list[View], list[View]]
+"""the views of the photos before, after and to measure by"""
+
+
+def sites_of(surfaces: Surfaces, up: Tensor, groups: Groups, seed: int) -> list[Site]:
+    """The planes on which enough photos see enough places, the one with the most first; and the air."""
     rng = np.random.default_rng([seed, 7])
-    best: Site | None = None
+    found = []
     for plane in surfaces.planes:
-        height = np.abs(plane.height(surfaces.points))
         even = max(3 * plane.noise, 1e-9)
-        on = surfaces.points[height < even].astype(np.float64)
+        on = surfaces.points[np.abs(plane.height(surfaces.points)) < even].astype(np.float64)
         if len(on) == 0:
             continue
         normal = torch.from_numpy(plane.normal.astype(np.float64))
@@ -57,17 +61,16 @@ def site_of(surfaces: Surfaces, up: Tensor, groups: tuple[list[View], list[View]
         on = on[rng.choice(len(on), min(_CANDIDATES, len(on)), replace=False)]
         on -= (on @ normal.numpy() - plane.offset)[:, None] * normal.numpy()
         spots, width = _well_seen(on, surfaces, groups)
-        if len(spots) and (best is None or len(spots) > len(best.centres)):
-            best = Site(surfaces, normal, plane.offset, even, spots, width)
-    return best or _in_the_air(surfaces, up, groups, rng)
+        if len(spots):
+            found.append(Site(surfaces, normal, plane.offset, even, spots, width))
+    found.sort(key=lambda site: -len(site.centres))
+    return [*found, _in_the_air(surfaces, up, groups, rng)]
 
 
-def _well_seen(
-    spots: NDArray[np.float64], surfaces: Surfaces, groups: tuple[list[View], list[View], list[View]]
-) -> tuple[NDArray[np.float64], float]:
+def _well_seen(spots: NDArray[np.float64], surfaces: Surfaces, groups: Groups) -> tuple[NDArray[np.float64], float]:
     """Those of the spots (S, 3) that enough photos see, best first; and how wide a picture is there."""
     at = torch.from_numpy(spots)
-    seen = [torch.stack([view.sees(at, surfaces.noise, 0.12) for view in group]) for group in groups]
+    seen = [torch.stack([view.sees(at, surfaces.noise, _INSET) for view in group]) for group in groups]
     before, after, evaluation = (s.sum(0) for s in seen)
     enough = (before >= _FEWEST_OLD * len(groups[0])) & (after >= len(groups[1]) - _MISSED_NEW) & (evaluation >= 1)
     order = before[enough].argsort(descending=True)
@@ -82,13 +85,11 @@ def _well_seen(
     return chosen.numpy(), float(torch.stack(widths).median())
 
 
-def _in_the_air(
-    surfaces: Surfaces, up: Tensor, groups: tuple[list[View], list[View], list[View]], rng: np.random.Generator
-) -> Site:
+def _in_the_air(surfaces: Surfaces, up: Tensor, groups: Groups, rng: np.random.Generator) -> Site:
     """Free places in front of the surfaces, in the middle of what the photos show."""
     start = torch.stack([view.frame.centre for view in surfaces.views]).numpy()
     goal = surfaces.points[rng.choice(len(surfaces.points), 20 * _CANDIDATES)].astype(np.float64)
-    part = rng.uniform(0.4, 0.9, (len(goal), 1))
+    part = rng.uniform(0.3, 0.9, (len(goal), 1))
     spots = start[rng.integers(len(start), size=len(goal))] * (1 - part) + goal * part
     spots, width = _well_seen(spots, surfaces, groups)
     return Site(surfaces, up.double(), None, 0.0, spots[:_CANDIDATES], width)

@@ -36,6 +36,7 @@ _LEANS = 60  # tried
 _SLOPE = np.cos(np.deg2rad(40.0))  # most of the normals that a noisy depth has on a floor lean by less
 _STEP = 4  # coarse pixels, to the neighbours that tell a normal
 _NEARER = 0.6  # of the level points count: farther off the field is rough
+_PEAK = 2.0  # times as many points lie on a plane as beside it, in a layer as thick
 _SHARE, _FEWEST = 0.08, 200  # of the level points lie on a plane that counts
 _MOST_POINTS = 40_000
 _MAD = 1.4826
@@ -83,9 +84,7 @@ class Surfaces:
     """that things can stand on, the largest first"""
 
 
-def surfaces_of(
-    field: Field, frames: Sequence[Frame], up: Tensor, on_progress: Progress | None = None
-) -> Surfaces:
+def surfaces_of(field: Field, frames: Sequence[Frame], up: Tensor, on_progress: Progress | None = None) -> Surfaces:
     """Of a field, from where its photos were taken. ``up``: (3,), unit."""
     views = []
     for i, frame in enumerate(frames):
@@ -147,10 +146,12 @@ def _planes(views: Sequence[View], up: Tensor, resolved: float) -> list[Plane]:
         rest = rest[rng.choice(len(rest), _MOST_POINTS, replace=False)]
     planes, total = [], len(rest)
     for _ in range(3):
-        plane, on = _level_plane(rest, up.double().numpy(), 2 * resolved, rng)
+        plane, on = _level_plane(rest, up.double().numpy(), resolved, rng)
         if on.sum() < max(_FEWEST, _SHARE * total):
             break
-        planes.append(plane)
+        beside = np.abs(rest @ plane.normal - plane.offset) < 3 * resolved
+        if on.sum() > _PEAK * (beside.sum() - on.sum()) / 2:  # else points at all heights, no plane
+            planes.append(plane)
         rest = rest[~on]
     return planes
 
@@ -245,7 +246,9 @@ def _grown(depth: Tensor, size: tuple[int, int], noise: float) -> Tensor:
     smooth = cv2.resize(inverse, wanted, interpolation=cv2.INTER_LINEAR)
     nearest = cv2.resize(inverse, wanted, interpolation=cv2.INTER_NEAREST_EXACT)
     square = np.ones((3, 3), np.uint8)
-    lo, hi = (cv2.resize(f(inverse, square), wanted, interpolation=cv2.INTER_NEAREST_EXACT) for f in (cv2.erode, cv2.dilate))
+    lo, hi = (
+        cv2.resize(f(inverse, square), wanted, interpolation=cv2.INTER_NEAREST_EXACT) for f in (cv2.erode, cv2.dilate)
+    )
     edge = hi > lo * (1 + 0.1 + 4 * _SURE * noise)  # one surface seen at a slant changes by less from point to point
     with np.errstate(divide="ignore"):
         return torch.from_numpy(1 / np.where(edge, nearest, smooth).astype(np.float32))

@@ -145,9 +145,7 @@ def first_at(shot: Shot, state: State, pixels: Tensor) -> Tensor:
     return first_hits(state, camera_rays(shot.camera, shot.world_from_cam, pixels)).item
 
 
-def _seen(
-    shot: Shot, state: State, light: Light, pixels: Tensor, limit: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _seen(shot: Shot, state: State, light: Light, pixels: Tensor, limit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of pixels (N, 2): the item seen (N,), its depth (N,) and linear colour (N, 3), black where none is."""
     rays = camera_rays(shot.camera, shot.world_from_cam, pixels)
     hits = first_hits(state, rays)

@@ -192,5 +192,3 @@ def _about(axis: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     across = torch.linalg.svd(axis[None].double())[2][1:]
     d = x[:, None] * across[0] + y[:, None] * across[1] + z[:, None] * axis.double()
     return d / d.norm(dim=-1, keepdim=True)
-
-

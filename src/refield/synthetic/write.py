@@ -129,9 +129,7 @@ def silhouette_in(state: State, name: str, frame: Frame) -> Tensor:
     return silhouette(state, name, frame.camera, frame.world_from_cam)
 
 
-def true_change(
-    world: World, before: Capture, frames: Sequence[Frame], shown: Shown = silhouette_in
-) -> SceneChange:
+def true_change(world: World, before: Capture, frames: Sequence[Frame], shown: Shown = silhouette_in) -> SceneChange:
     """What `estimate` should find: masks as in ``before.train``, and the new photos all used."""
     seen = [masks_of(world, frame, shown) for frame in frames]
     return SceneChange(
