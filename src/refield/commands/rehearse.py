@@ -1,4 +1,4 @@
-"""``refield rehearse WORK``: known changes put into a workspace's own photos, to learn what an update is worth there."""
+"""``refield rehearse WORK``: known changes put into a workspace's own photos; what an update is worth there."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _MOST = 100
 
 @dataclass(frozen=True)
 class Rehearse:
-    """Put known objects and changes into a workspace's own photos, train and update on them, and say how well that went.
+    """Put known objects and changes into a workspace's own photos, train and update on them, and tell how well it went.
 
     The workspace stays as it is. Each rehearsal takes about as long as a training and an update.
     """

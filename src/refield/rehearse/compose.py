@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +111,7 @@ def compose(scenery: Scenery, out: Path, seed: int, on_progress: Count | None = 
         ("eval", photos.evaluation, world.after),
     ):
         first, done = done, done + len(frames)
-        tell = None if on_progress is None else lambda k: on_progress(first + k, total)
+        tell = None if on_progress is None else partial(_tell, on_progress, first, total)
         captures[folder] = studio.photograph(out / folder, frames, state, tell)
     for folder in ("after", "eval"):
         studio.write_masks(out / folder, captures[folder])
@@ -118,6 +119,10 @@ def compose(scenery: Scenery, out: Path, seed: int, on_progress: Count | None = 
     save_change(out / "truth", true_change(world, captures["before"], captures["after"].frames, studio.shown))
     write_json(out / "truth" / "world.json", plan.facts | _size(captures))
     return plan
+
+
+def _tell(on_progress: Count, first: int, total: int, done: int) -> None:
+    on_progress(first + done, total)
 
 
 def _size(captures: dict[str, Capture]) -> dict[str, Any]:

@@ -115,7 +115,7 @@ def is_free(site: Site, spot: NDArray[np.float64], radius: float, height: float)
         blocked = within & (np.abs(above) < _SPARE * height / 2)
         views = site.surfaces.views
         across = 2 * radius / site.width * min(views[0].depth.shape)  # pixels that a surface there would fill
-        return bool(blocked.sum() <= _DUST * across**2 * len(views))
+        return bool(blocked.sum() <= _DUST * across**2 * len(views) * site.surfaces.kept)
     over = within & (above > 2 * site.even) & (above < _SPARE * height)
     ground = within & (np.abs(above) <= site.even)
     if over.sum() > _DUST * ground.sum() or ground.sum() < 12:

@@ -38,7 +38,7 @@ _STEP = 4  # coarse pixels, to the neighbours that tell a normal
 _NEARER = 0.6  # of the level points count: farther off the field is rough
 _PEAK = 2.0  # times as many points lie on a plane as beside it, in a layer as thick
 _SHARE, _FEWEST = 0.08, 200  # of the level points lie on a plane that counts
-_MOST_POINTS = 40_000
+_MOST_POINTS, _MOST_LEVEL = 200_000, 40_000
 _MAD = 1.4826
 
 
@@ -77,7 +77,9 @@ class Surfaces:
     noise: float
     """how uncertain a depth is, as a part of it: its deviation between views, or a coarse pixel"""
     points: NDArray[np.float32]
-    """(P, 3) of all views, world"""
+    """(P, 3) of all views, world; some of them, drawn at random, where they are many"""
+    kept: float
+    """which part of the views' points these are"""
     colours: NDArray[np.float32]
     """(P, 3) in [0, 1]"""
     planes: tuple[Plane, ...]
@@ -92,13 +94,14 @@ def surfaces_of(field: Field, frames: Sequence[Frame], up: Tensor, on_progress: 
         if on_progress is not None:
             on_progress(i + 1, len(frames))
     noise = _noise(views)
-    clouds = [view.points()[view.depth.isfinite()] for view in views]
-    points = torch.cat(clouds).numpy()
+    points = torch.cat([view.points()[view.depth.isfinite()] for view in views]).numpy()
     colours = torch.cat([view.rgb[view.depth.isfinite()] for view in views]).numpy()
+    kept = min(1.0, _MOST_POINTS / max(len(points), 1))
+    chosen = np.random.default_rng(0).random(len(points)) < kept
     distance = float(torch.cat([view.depth[view.depth.isfinite()] for view in views]).median()) if len(points) else 0.0
     pixel = float(np.mean([1 / view.camera.fx for view in views]))
     planes = _planes(views, up, max(noise, pixel) * distance)
-    return Surfaces(tuple(views), max(noise, pixel), points, colours, tuple(planes))
+    return Surfaces(tuple(views), max(noise, pixel), points[chosen], kept, colours[chosen], tuple(planes))
 
 
 def _view(field: Field, frame: Frame) -> View:
@@ -142,8 +145,8 @@ def _planes(views: Sequence[View], up: Tensor, resolved: float) -> list[Plane]:
         return []
     rest = rest[depth <= np.quantile(depth, _NEARER)]
     rng = np.random.default_rng(0)
-    if len(rest) > _MOST_POINTS:
-        rest = rest[rng.choice(len(rest), _MOST_POINTS, replace=False)]
+    if len(rest) > _MOST_LEVEL:
+        rest = rest[rng.choice(len(rest), _MOST_LEVEL, replace=False)]
     planes, total = [], len(rest)
     for _ in range(3):
         plane, on = _level_plane(rest, up.double().numpy(), resolved, rng)

@@ -30,7 +30,7 @@ Shadow = Callable[[Tensor], Tensor]
 """world points (N, 3) -> the part of the light that still reaches them, (N,)"""
 
 _FINE = 3  # rays a side of a pixel on an outline
-_SHADOW_POINTS = 60_000  # a picture, at most; a soft shadow between them is interpolated
+_SHADOW_POINTS = 20_000  # a picture, at most; a soft shadow between them is interpolated
 _LEAST_SHADE = 2e-3  # a darkening that 8 bits do not show
 
 
@@ -71,7 +71,7 @@ def inserted(shot: Shot, state: State, light: Light, shadow: Shadow, seed: int =
         return seen
     item, depth, colour, alpha = _layer(shot, state, light, window)
     seen.item[window] = item
-    picture = to_linear(shot.image.numpy().astype(np.float32) / 255)
+    picture = to_linear(shot.image.numpy().astype(np.float32) / np.float32(255))
     dark = _shade(shot, state, shadow)
     picture *= dark[..., None]
     over, cover = _blurred(shot, window, colour * shot.look.gain.numpy(), alpha)
@@ -202,8 +202,10 @@ def _blurred(
     height, width = shot.surface.shape
     over, cover = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
     if shot.look.blur > 0:
-        colour = cv2.GaussianBlur(colour, (0, 0), shot.look.blur, borderType=cv2.BORDER_REPLICATE)
-        alpha = cv2.GaussianBlur(alpha, (0, 0), shot.look.blur, borderType=cv2.BORDER_REPLICATE)
+        colour = np.asarray(
+            cv2.GaussianBlur(colour, (0, 0), shot.look.blur, borderType=cv2.BORDER_REPLICATE), np.float32
+        )
+        alpha = np.asarray(cv2.GaussianBlur(alpha, (0, 0), shot.look.blur, borderType=cv2.BORDER_REPLICATE), np.float32)
     over[window], cover[window] = colour, np.where(alpha < _LEAST_SHADE, 0, alpha)
     over[cover == 0] = 0
     return over, cover

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -71,7 +72,7 @@ def blur_of(grey: NDArray[np.float32]) -> float:
     return float(np.sqrt(np.clip(variance, 0.09, _MOST_BLUR**2)))
 
 
-def _gradient(grey: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _gradient(grey: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Central differences, a pixel."""
     x, y = (cv2.Sobel(grey, cv2.CV_32F, *order, ksize=1, scale=0.5) for order in ((1, 0), (0, 1)))
     return np.asarray(x, np.float32), np.asarray(y, np.float32)
