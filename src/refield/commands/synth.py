@@ -1,4 +1,7 @@
-"""``refield synth WORLD OUT``: path-trace a world that is known exactly, with masks and the true change."""
+"""``refield synth WORLD OUT``: path-trace a world that is known exactly, with masks and the true change.
+
+The world ``random`` draws all from its seed; `random_write` lays it out as the others, and adds ``truth/world.json``.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,10 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from refield.artefacts import writable
 from refield.commands.clock import Clock
 from refield.scene.errors import InputError
+from refield.synthetic.random_write import write_random
 from refield.synthetic.write import SynthConfig, write_world
+
+RANDOM = "random"
 
 
 @dataclass(frozen=True)
@@ -19,7 +25,7 @@ class Synth:
     """Photograph a known world before and after a change (needs Mitsuba: pip install 'refield[synth]')."""
 
     world: Annotated[str, arg(metavar="WORLD"), Positional]
-    """the world's name; an unknown one lists them all"""
+    """the world's name, or random: all of it drawn from --seed; an unknown one lists them all"""
     out: Annotated[Path, arg(metavar="OUT"), Positional]
     """the folder for before/, after/, eval/ and truth/"""
     into: Path | None = None
@@ -37,13 +43,14 @@ def run(options: Synth) -> None:
         _into(options, options.into, clock)
         return
     clock.stage(f"path-trace {options.world}")
+    _refuse_the_others_options(options)
     with writable(options.out), clock.counting("photos") as count:
-        write_world(
-            options.world,
-            options.out,
-            **asdict(options.config),
-            on_progress=count,
-        )
+        if options.world == RANDOM:
+            write_random(options.out, options.config, on_progress=count)
+        else:
+            told = asdict(options.config)
+            del told["photos"]
+            write_world(options.world, options.out, **told, on_progress=count)
     clock.stop()
     print(f"{options.world} is in {options.out} ({clock.total:.0f} s)")
 
@@ -53,7 +60,7 @@ def _into(options: Synth, work: Path, clock: Clock) -> None:
     from refield.commands.rehearse import opened
     from refield.rehearse.compose import compose, scenery_of
 
-    if options.world != "random":
+    if options.world != RANDOM:
         raise InputError("--into", f"does not go with the world {options.world!r}", "give the world 'random'")
     workspace = opened(work)
     clock.stage("find out how far off things are")
@@ -64,6 +71,13 @@ def _into(options: Synth, work: Path, clock: Clock) -> None:
         plan = compose(scenery, options.out, options.config.seed, count)
     clock.stop()
     print(f"{plan.facts['happening']}: {options.out} ({clock.total:.0f} s)")
+
+
+def _refuse_the_others_options(options: Synth) -> None:
+    if options.world == RANDOM and options.config.cameras is not None:
+        raise InputError("--cameras", "is for the worlds that have a name", "give --photos for the world random")
+    if options.world != RANDOM and options.config.photos is not None:
+        raise InputError("--photos", f"is for the world {RANDOM}", f"give --cameras for {options.world}")
 
 
 def _refuse_unless_free(out: Path, *, overwrite: bool) -> None:

@@ -116,7 +116,7 @@ def compose(scenery: Scenery, out: Path, seed: int, on_progress: Count | None = 
     for folder in ("after", "eval"):
         studio.write_masks(out / folder, captures[folder])
     (out / "truth").mkdir(exist_ok=True)
-    save_change(out / "truth", true_change(world, captures["before"], captures["after"].frames, studio.shown))
+    save_change(out / "truth", true_change(world, captures["before"], captures["after"].frames, studio.seen))
     write_json(out / "truth" / "world.json", plan.facts | _size(captures))
     return plan
 
@@ -172,18 +172,15 @@ class _Studio:
         for kind in ("masks_in", "masks_out", "depth"):
             (folder / kind).mkdir(parents=True, exist_ok=True)
         for frame in capture.frames:
-            now, then = masks_of(self._plan.world, frame, self.shown)
+            now, then = masks_of(self._plan.world, frame, self.seen)
             write_image(folder / "masks_in" / frame.path.name, now)
             write_image(folder / "masks_out" / frame.path.name, then)
             depth = self._picture(frame, "after").depth
             np.savez_compressed(folder / "depth" / f"{frame.path.stem}.npz", depth=depth.numpy())
 
-    def shown(self, state: State, name: str, frame: Frame) -> Tensor:
-        """Which pixels of a photo would show the named item in a state, (H, W) bool."""
-        label = next(n for n, s in self._states() if s is state)
-        index = next((i for i, item in enumerate(state.items) if item.name == name), None)
-        item = self._picture(frame, label).item
-        return torch.zeros_like(item, dtype=torch.bool) if index is None else item == index
+    def seen(self, state: State, frame: Frame) -> Tensor:
+        """Which item of a state each pixel of a photo would show, (H, W) int64, -1 for none: the truth's `Seen`."""
+        return self._picture(frame, next(n for n, s in self._states() if s is state)).item
 
     def _picture(self, frame: Frame, label: str) -> Inserted:
         key = (frame.path, label)

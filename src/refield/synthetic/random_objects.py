@@ -37,14 +37,24 @@ _LETTERS: dict[str, list[tuple[float, float, float, float]]] = {
 
 
 def random_item(
-    rng: np.random.Generator, name: str, size: float, *, family: str | None = None, patterns: tuple[Pattern, ...] = PATTERNS
+    rng: np.random.Generator,
+    name: str,
+    size: float,
+    *,
+    family: str | None = None,
+    patterns: tuple[Pattern, ...] = PATTERNS,
 ) -> Item:
     """An object resting on z = 0 about the origin, its box's root mean square side ``size`` metres."""
     return drawn_item(rng, name, size, family=family, patterns=patterns)[0]
 
 
 def drawn_item(
-    rng: np.random.Generator, name: str, size: float, *, family: str | None = None, patterns: tuple[Pattern, ...] = PATTERNS
+    rng: np.random.Generator,
+    name: str,
+    size: float,
+    *,
+    family: str | None = None,
+    patterns: tuple[Pattern, ...] = PATTERNS,
 ) -> tuple[Item, str, Pattern]:
     """As `random_item`, and the names of its family and its pattern."""
     family = family or str(rng.choice(list(FAMILIES)))
@@ -227,9 +237,7 @@ def _car(rng: np.random.Generator, sides: Sides) -> Solid:
     at = [(a * x, b, wheel) for a in (0.22, 0.78) for b in (-wide / 2, y + wide / 2)]
     wheels = [Part(Cylinder(wheel, wide), place, lying) for place in at]
     cabin = prism([(0, 0), (0.55 * x, 0), (0.55 * x, 0.9 * y), (0, 0.9 * y)], 0.42 * z, 0.75)
-    return Compound.of(
-        [_block((0, 0, 0.2 * z), (x, y, 0.58 * z)), Part(cabin, (0.45 * x, y / 2, 0.79 * z)), *wheels]
-    )
+    return Compound.of([_block((0, 0, 0.2 * z), (x, y, 0.58 * z)), Part(cabin, (0.45 * x, y / 2, 0.79 * z)), *wheels])
 
 
 def _bottle(rng: np.random.Generator, sides: Sides) -> Solid:
@@ -268,9 +276,7 @@ def _figure(rng: np.random.Generator, sides: Sides) -> Solid:
     body, head = 0.65 * z, 0.42 * z
     torso = RoundedBox(_half(np.array([x, y, body])), 0.4 * min(x, y, body) / 2)
     top = body + 0.42 * head
-    return Compound.of(
-        [Part(torso, (0.0, 0.0, body / 2)), Part(Ellipsoid(_half(np.full(3, head))), (0.0, 0.0, top))]
-    )
+    return Compound.of([Part(torso, (0.0, 0.0, body / 2)), Part(Ellipsoid(_half(np.full(3, head))), (0.0, 0.0, top))])
 
 
 def _plant(rng: np.random.Generator, sides: Sides) -> Solid:

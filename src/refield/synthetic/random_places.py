@@ -183,7 +183,9 @@ def _shelf(rng: np.random.Generator, reach: float) -> Place:
     items.append(slab_item("back wall", (-3.5 * reach, back, 0), (3.5 * reach, back + _THICK, top + reach), paint))
     patches = tuple(Patch((-0.93 * wide, -deep / 2), (0.93 * wide, deep / 2), z) for z in levels)
     target = (0.0, 0.0, (levels[0] + levels[-1]) / 2 + 0.35 * step)
-    return Place("", tuple(items), patches, reach * (1.0 if boards == 2 else 1.25), target, 0.5 * reach, _FRONT, True, "")
+    return Place(
+        "", tuple(items), patches, reach * (1.0 if boards == 2 else 1.25), target, 0.5 * reach, _FRONT, True, ""
+    )
 
 
 def _steps(rng: np.random.Generator, reach: float) -> Place:

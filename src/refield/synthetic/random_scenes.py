@@ -75,7 +75,9 @@ def _onto(
 ) -> Item | None:
     for i in rng.permutation(len(others)):
         if turn is not None:
-            item = replace(item, world_from_item=change.placed_on(item, place.patches[0], (0.0, 0.0), turn).world_from_item)
+            item = replace(
+                item, world_from_item=change.placed_on(item, place.patches[0], (0.0, 0.0), turn).world_from_item
+            )
         placed = change.stacked(rng, item, others[int(i)])
         if placed is not None and change.apart(placed, [*others, *place.items[1:]]):
             return placed
@@ -135,7 +137,9 @@ def draw_change(rng: np.random.Generator, place: Place, things: Sequence[Thing])
 def _floats(items: dict[str, Item], kinds: dict[str, str]) -> bool:
     """Whether an object stands on one that changes in another way than with it: what is stacked in ``kinds`` may."""
     bearing = _bearing(list(items.values()))
-    return any(kinds[name] not in ("none", "tipped", "turned", "slid", "moved", "stacked", "swapped") for name in bearing)
+    return any(
+        kinds[name] not in ("none", "tipped", "turned", "slid", "moved", "stacked", "swapped") for name in bearing
+    )
 
 
 def _moved(rng: np.random.Generator, item: Item, others: Sequence[Item], place: Place) -> Item | None:

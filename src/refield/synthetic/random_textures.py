@@ -86,7 +86,9 @@ def atlas(rng: np.random.Generator, solid: Solid, style: Style, size: int = 128)
         return _parts(rng, solid, style, size)
     if isinstance(solid, Sphere | Cylinder | Cone | Ellipsoid):
         return _wrapped(rng, solid, style, size)
-    rows, columns = solid.cells if isinstance(solid, Convex) else (2, 3) if isinstance(solid, Box | RoundedBox) else (1, 1)
+    rows, columns = (
+        solid.cells if isinstance(solid, Convex) else (2, 3) if isinstance(solid, Box | RoundedBox) else (1, 1)
+    )
     size = max(min(size, _MOST // columns), _LEAST)
     faces = [[face(rng, style, size) for _ in range(columns)] for _ in range(rows)]
     return np.concatenate([np.concatenate(row, 1) for row in faces], 0)

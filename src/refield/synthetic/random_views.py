@@ -80,7 +80,9 @@ def seen_by(views: Views, fixed: Tensor, drawn: Drawn) -> dict[str, dict[str, fl
             if shown[looks].mean() > _LARGEST or shown.max() > 2 * _LARGEST:
                 return None
             facts["picture_share" + when.replace(" ", "_")] = float(shown[looks].mean())
-            facts["visible_share" + when.replace(" ", "_")] = float(shown[looks].sum() / whole[looks].sum().clamp_min(1e-9))
+            facts["visible_share" + when.replace(" ", "_")] = float(
+                shown[looks].sum() / whole[looks].sum().clamp_min(1e-9)
+            )
         out[name] = facts
     nearest = torch.stack(list(depths.values())).flatten(2).amin((0, 2))
     return out if bool((nearest > _BEFORE_LENS * views.distance).all()) else None

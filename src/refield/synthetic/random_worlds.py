@@ -97,9 +97,7 @@ def _frame(rng: np.random.Generator) -> _Frame:
     setting = str(rng.choice(["room", "studio", "outdoors"], p=[0.4, 0.15, 0.45]))
     place, camera = draw_place(rng, outdoors=setting == "outdoors"), draw_camera(rng)
     path = draw_path(rng, place, camera)
-    views = Views(
-        camera, path.poses(rng, _TESTED), path.new_poses(rng, NEW), path.new_poses(rng, NEW), path.distance
-    )
+    views = Views(camera, path.poses(rng, _TESTED), path.new_poses(rng, NEW), path.new_poses(rng, NEW), path.distance)
     eyes = np.stack([pose[:3, 3].numpy() for pose in views.all])
     if setting == "room":
         wide = float(np.abs(eyes[:, :2]).max()) + float(rng.uniform(0.3, 1.0))
@@ -123,7 +121,9 @@ def _scene(rng: np.random.Generator, frame: _Frame) -> _Scene | None:
         drawn = draw_change(rng, place, things)
         if drawn is None:
             continue
-        before, after = (light.on(replace(empty, items=(*place.items, *items))) for items in (drawn.before, drawn.after))
+        before, after = (
+            light.on(replace(empty, items=(*place.items, *items))) for items in (drawn.before, drawn.after)
+        )
         seen = seen_by(views, fixed, drawn)
         if seen is not None:
             return drawn.things, drawn.kinds, before, after, seen

@@ -24,14 +24,16 @@ from refield.scene.images import write_image
 from refield.scene.transforms_json import save_transforms
 from refield.synthetic.cameras import hemisphere, ring, square_camera
 from refield.synthetic.pathtrace import PathTracer
-from refield.synthetic.state import State, TrueChange, World
-from refield.synthetic.visibility import silhouette, view_hits
+from refield.synthetic.state import Item, State, TrueChange, World
+from refield.synthetic.visibility import view_hits
 from refield.synthetic.worlds import WORLDS
 
+CAMERAS = 180
+"""old photos, unless told otherwise (§11.1)"""
 Progress = Callable[[int, int], None]
 """Called with the pictures done and their number."""
-Shown = Callable[[State, str, Frame], Tensor]
-"""Which pixels of a photo show the named item in a state, (H, W) bool."""
+Seen = Callable[[State, Frame], Tensor]
+"""Which item of a state each pixel's centre of a photo shows, (H, W) int64, -1 for none."""
 
 
 @dataclass(frozen=True)
@@ -42,15 +44,18 @@ class SynthConfig:
     """pixels a side"""
     spp: int = 64
     """light paths a pixel"""
-    cameras: int = 180
-    """of the old photos, on 10 heights (§11.1)"""
+    cameras: int | None = None
+    """of the old photos, on 10 heights; 180 if not given (§11.1). Not for the world random"""
+    photos: int | None = None
+    """old photos of the world random; if not given, as many as its seed says, 30 to 120"""
     seed: int = 0
     """of textures, surroundings and the paths"""
 
     def __post_init__(self) -> None:
-        for name, least in (("size", 8), ("spp", 1), ("cameras", 10), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"--{name}", f"is {getattr(self, name)}", f"give at least {least}")
+        for name, least in (("size", 8), ("spp", 1), ("cameras", 10), ("photos", 10), ("seed", 0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise InputError(f"--{name}", f"is {value}", f"give at least {least}")
 
 
 def write_world(
@@ -59,26 +64,26 @@ def write_world(
     *,
     size: int = 128,
     spp: int = 64,
-    cameras: int = 180,
+    cameras: int | None = None,
     seed: int = 0,
     on_progress: Progress | None = None,
 ) -> World:
-    """Render the world called ``name`` into the folder ``out``.
+    """Render the world called ``name`` into the folder ``out``; for the world random see `random_write`.
 
     Raises:
         InputError: there is no such world, a number is out of range, or Mitsuba is not installed.
     """
     if name not in WORLDS:
-        raise InputError(f"world {name!r}", "there is no such world", f"choose one of {', '.join(WORLDS)}")
+        raise InputError(f"world {name!r}", "there is no such world", f"choose random or one of {', '.join(WORLDS)}")
     world = WORLDS[name](seed)
-    photograph(world, out, SynthConfig(size, spp, cameras, seed), on_progress)
+    photograph(world, out, SynthConfig(size, spp, cameras, seed=seed), on_progress)
     return world
 
 
 def photograph(world: World, out: Path, config: SynthConfig, on_progress: Progress | None = None) -> None:
     """Render a world's old photos, new photos (every other one for evaluation), masks and the truth."""
     camera = square_camera(config.size)
-    old, new = hemisphere(config.cameras, world.target), ring(world.target)
+    old, new = hemisphere(config.cameras or CAMERAS, world.target), ring(world.target)
     total, done = len(old) + len(new), 0
 
     def shoot(folder: str, state: State, poses: Sequence[Tensor]) -> Capture:
@@ -124,48 +129,60 @@ def shoot_state(
     return capture
 
 
-def silhouette_in(state: State, name: str, frame: Frame) -> Tensor:
-    """Pixels of a photo that show the named item of a world, where there is nothing else: the `Shown` of worlds."""
-    return silhouette(state, name, frame.camera, frame.world_from_cam)
+def _alone(state: State, frame: Frame) -> Tensor:
+    """What a photo shows of a world in which there is nothing else."""
+    return seen_items(state, frame.camera, frame.world_from_cam)
 
 
-def true_change(world: World, before: Capture, frames: Sequence[Frame], shown: Shown = silhouette_in) -> SceneChange:
+def true_change(world: World, before: Capture, frames: Sequence[Frame], seen: Seen = _alone) -> SceneChange:
     """What `estimate` should find: masks as in ``before.train``, and the new photos all used."""
-    seen = [masks_of(world, frame, shown) for frame in frames]
+    then, now = ([seen(state, f) for f in before.train] for state in (world.before, world.after))
+    pairs = [masks_of(world, f, seen) for f in frames]
     return SceneChange(
-        objects=tuple(_object_change(world, change, before.train, shown) for change in world.changes),
+        objects=tuple(_object_change(world, change, then, now) for change in world.changes),
         photos=tuple(PlacedPhoto(frame.name, "used", frame=frame) for frame in frames),
         why="known from the world's description",
-        masks_in=tuple(now for now, _ in seen),
-        masks_out=tuple(then for _, then in seen),
+        masks_in=tuple(now for now, _ in pairs),
+        masks_out=tuple(then for _, then in pairs),
     )
+
+
+def seen_items(state: State, camera: Camera, world_from_cam: Tensor) -> Tensor:
+    """Which item each pixel's centre shows, (H, W) int64, -1 for none."""
+    return view_hits(state, camera, world_from_cam).item
 
 
 def masks(world: World, camera: Camera, world_from_cam: Tensor) -> tuple[Tensor, Tensor]:
     """Move-in (what arrived, visible now) and move-out (what was there, visible then), (H, W) bool each."""
-    return masks_of(world, Frame(Path(), camera, "", world_from_cam), silhouette_in)
+    then, now = (seen_items(state, camera, world_from_cam) for state in (world.before, world.after))
+    return _masks(world, then, now)
 
 
-def masks_of(world: World, frame: Frame, shown: Shown) -> tuple[Tensor, Tensor]:
-    """`masks` of a photo."""
-    none = torch.zeros(frame.camera.height, frame.camera.width, dtype=torch.bool)
-    now = [shown(world.after, c.new.name, frame) for c in world.changes if c.new]
-    then = [shown(world.before, c.old.name, frame) for c in world.changes if c.old]
-    return reduce(torch.logical_or, now, none), reduce(torch.logical_or, then, none)
+def masks_of(world: World, frame: Frame, seen: Seen) -> tuple[Tensor, Tensor]:
+    """`masks` of a photo, by what it shows."""
+    return _masks(world, seen(world.before, frame), seen(world.after, frame))
 
 
-def _object_change(world: World, change: TrueChange, frames: Sequence[Frame], shown: Shown) -> ObjectChange:
-    def seen(state: State, name: str) -> tuple[Tensor, ...]:
-        return tuple(shown(state, name, f) for f in frames)
+def _masks(world: World, then: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
+    none = torch.zeros_like(now, dtype=torch.bool)
+    news = [_shows(world.after, c.new, now) for c in world.changes if c.new]
+    olds = [_shows(world.before, c.old, then) for c in world.changes if c.old]
+    return reduce(torch.logical_or, news, none), reduce(torch.logical_or, olds, none)
 
+
+def _shows(state: State, item: Item, index: Tensor) -> Tensor:
+    return index == [other.name for other in state.items].index(item.name)
+
+
+def _object_change(world: World, change: TrueChange, then: Sequence[Tensor], now: Sequence[Tensor]) -> ObjectChange:
     item = change.old or change.new
     assert item is not None  # a change has one side at least
     return ObjectChange(
         kind=change.kind,
         grid=item.grid(),
         new_from_old=change.new_from_old,
-        masks=seen(world.before, change.old.name) if change.old else (),
-        masks_in=seen(world.after, change.new.name) if change.new else (),
+        masks=tuple(_shows(world.before, change.old, index) for index in then) if change.old else (),
+        masks_in=tuple(_shows(world.after, change.new, index) for index in now) if change.new else (),
     )
 
 
@@ -174,8 +191,8 @@ def write_masks(world: World, folder: Path, capture: Capture) -> None:
     for kind in ("masks_in", "masks_out", "depth"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     for frame in capture.frames:
-        now, then = masks(world, frame.camera, frame.world_from_cam)
+        hits = view_hits(world.after, frame.camera, frame.world_from_cam)
+        now, then = _masks(world, seen_items(world.before, frame.camera, frame.world_from_cam), hits.item)
         write_image(folder / "masks_in" / frame.path.name, now)
         write_image(folder / "masks_out" / frame.path.name, then)
-        depth = view_hits(world.after, frame.camera, frame.world_from_cam).depth
-        np.savez_compressed(folder / "depth" / f"{frame.path.stem}.npz", depth=depth.numpy())
+        np.savez_compressed(folder / "depth" / f"{frame.path.stem}.npz", depth=hits.depth.numpy())
