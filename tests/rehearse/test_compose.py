@@ -114,7 +114,7 @@ def test_without_a_plane_things_float_and_this_is_told(scenery, tmp_path):
 
 
 def test_where_no_photo_sees_anything_there_is_no_place(scenery, tmp_path):
-    views = tuple(replace(v, depth=v.depth * 1e-3) for v in scenery.surfaces.views)
+    views = tuple(replace(v, depth=torch.full_like(v.depth, 1e-3)) for v in scenery.surfaces.views)
     with pytest.raises(InputError, match="no free place"):
         compose(replace(scenery, surfaces=replace(scenery.surfaces, views=views)), tmp_path, 0)
 
