@@ -46,8 +46,9 @@ def shaded(state: State, index: int, points: Tensor, directions: Tensor, light: 
     normals, size = _normals(item, points), 2 * max(item.solid.half)
     albedo = torch.from_numpy(to_linear(_painted(item, points).numpy())).double()
     start = points + 1e-3 * size * normals
-    sun = _open(state, start, _cone(light.sun, light.spread, _SUN_RAYS))
     facing = (normals @ light.sun).clamp_min(0)
+    sun = torch.zeros_like(facing)  # what looks away from it lies in its own shade
+    sun[facing > 0] = _open(state, start[facing > 0], _cone(light.sun, light.spread, _SUN_RAYS))
     direct = light.share * facing / float(light.up @ light.sun) * sun
     tilt = normals @ light.up
     above = _height(state, points, light.up) / (0.5 * size)
