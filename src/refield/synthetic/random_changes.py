@@ -78,6 +78,12 @@ def rotation(item: Item) -> Matrix:
     return item.world_from_item[:3, :3].numpy()
 
 
+def extent(item: Item) -> Matrix:
+    """(2, 3): the world box around its mesh."""
+    x = vertices_of(item.solid) @ rotation(item).T + item.world_from_item[:3, 3].numpy()
+    return np.stack([x.min(0), x.max(0)])
+
+
 def about_z(angle: float) -> Matrix:
     """Turned by so many radians about the upright."""
     c, s = np.cos(angle), np.sin(angle)
@@ -120,10 +126,10 @@ def rested(rng: np.random.Generator, item: Item, support: Support, turn: Matrix 
 
 def apart(item: Item, others: Iterable[Item], gap: float = GAP) -> bool:
     """Whether it keeps clear of the others: no sampled place of a surface lies in or near another solid."""
-    box = item.box().numpy()
+    box = extent(item)
     own = torch.from_numpy(_world(item))
     for other in others:
-        theirs = other.box().numpy()
+        theirs = extent(other)
         if (theirs[0] > box[1] + gap).any() or (theirs[1] < box[0] - gap).any():
             continue
         if (other.distance(own) < gap * _beside(item, other)).any():
@@ -137,7 +143,7 @@ def apart(item: Item, others: Iterable[Item], gap: float = GAP) -> bool:
 
 def _beside(item: Item, other: Item) -> float:
     """0 where one stands on the other, which may touch; else 1."""
-    a, b = item.box(), other.box()
+    a, b = extent(item), extent(other)
     on = float(a[0, 2]) > float(b[1, 2]) - 2 * _CLEAR or float(b[0, 2]) > float(a[1, 2]) - 2 * _CLEAR
     return 0.0 if on else 1.0
 
@@ -192,6 +198,8 @@ def top_of(item: Item) -> Top | None:
     middle = level[:, :2].mean(0)
     # the largest centred square that the samples of the top fill
     out = np.abs(on[:, :2] - middle).max(0)
+    if (out < 1e-6).any():  # a point, an edge
+        return None
     part = min(0.7, 0.7 * float(np.sqrt(len(np.unique((4 * (level[:, :2] - middle) / out).round(), axis=0)) / 60)))
     low, high = middle - part * out, middle + part * out
     wide = np.ptp(vertices[:, :2], axis=0)

@@ -71,14 +71,16 @@ def studio(rng: np.random.Generator) -> Light:
 
 
 def lamps(rng: np.random.Generator, place: Place, wide: float, high: float) -> Light:
-    """Under the ceiling of a room: panels, or a bulb beside a panel."""
+    """Under the ceiling of a room: panels, or a bulb beside a panel; never behind what the place has at its back."""
     family = str(rng.choice(["panels", "bulb"], p=[0.7, 0.3]))
+    back = -0.1 if place.faces_front else 1.0
     out = []
     for _ in range(int(rng.integers(1, 4)) if family == "panels" else 1):
-        half = (float(rng.uniform(0.1, 0.3)) * wide, float(rng.uniform(0.1, 0.3)) * wide)
-        x, y = (float(rng.uniform(-1, 1)) * (0.9 * wide - h) for h in half)
+        half = (float(rng.uniform(0.15, 0.35)) * wide, float(rng.uniform(0.15, 0.35)) * wide)
+        x = float(rng.uniform(-1, 1)) * (0.9 * wide - half[0])
+        y = float(rng.uniform(-0.9 * wide + half[1], back * (0.9 * wide - half[1])))
         out.append(Lamp((x, y, high - 0.01), _times(1 / (half[0] * half[1]), _tint(rng, 0.2)), half))
     if family == "bulb":
-        x, y = (float(v) for v in rng.uniform(-0.5, 0.5, 2) * wide)
+        x, y = float(rng.uniform(-0.5, 0.5)) * wide, float(rng.uniform(-0.5, 0.5 * back)) * wide
         out.append(Lamp((x, y, high - 0.25 * (high - place.target[2]) - 0.05), _times(4.0, _tint(rng, 0.25))))
     return Light(family, np.full((8, 16, 3), _DARK, np.float32), lamps=tuple(out))

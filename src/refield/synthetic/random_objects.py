@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -177,7 +178,7 @@ def _ring(radius: float, thickness: float, height: float, z: float = 0.0) -> lis
     angle = 2 * np.pi * np.arange(_ROUND_STEPS + 1) / _ROUND_STEPS
     circle = np.stack([np.cos(angle), np.sin(angle)], -1)
     parts = []
-    for a, b in zip(circle[:-1], circle[1:]):
+    for a, b in pairwise(circle):
         flat = np.array([a * radius, b * radius, b * (radius - thickness), a * (radius - thickness)])
         middle = (flat.min(0) + flat.max(0)) / 2
         stave = prism([(float(x), float(y)) for x, y in flat], height)

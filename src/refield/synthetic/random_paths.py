@@ -15,7 +15,6 @@ from refield.synthetic.cameras import looking_at
 from refield.synthetic.random_places import Place
 from refield.synthetic.state import Triple
 
-_FRONT = -np.pi / 2  # azimuth of the front
 _WAVES = 3  # of a hand's wander
 
 
@@ -95,14 +94,14 @@ def draw_path(rng: np.random.Generator, place: Place, camera: Camera) -> CameraP
     """A way around or before a place, from which its region about fills the picture."""
     family = str(rng.choice(list(place.views)))
     across = min(camera.width / camera.fx, camera.height / camera.fy) / 2
-    distance = place.reach * float(rng.uniform(0.95, 1.25)) / across
+    distance = place.reach * float(rng.uniform(0.8, 1.1)) / across
     low = float(rng.uniform(15, 35))
     laps = int(rng.integers(1, 4))
     azimuth, elevation = (0.0, 2 * np.pi), tuple(np.deg2rad(low + 14 * k) for k in range(laps))
     sway, jitter = np.zeros((5, _WAVES, 3)), float(rng.uniform(0.0, 0.02))
     if family == "half orbit":
         span = np.deg2rad(rng.uniform(80, 130) if place.faces_front else rng.uniform(120, 200))
-        azimuth = (_FRONT - span / 2, _FRONT + span / 2)
+        azimuth = (place.front - span / 2, place.front + span / 2)
     elif family == "dome":
         elevation = tuple(np.deg2rad(np.linspace(low - 3, 68, int(rng.integers(4, 7)))))
     elif family == "forward":
@@ -111,7 +110,7 @@ def draw_path(rng: np.random.Generator, place: Place, camera: Camera) -> CameraP
         elevation = tuple(base + v for v in np.linspace(-up / 2, up / 2, int(rng.integers(3, 6))))
     elif family == "hand-held":
         span = np.deg2rad(rng.uniform(80, 120) if place.faces_front else rng.uniform(150, 330))
-        azimuth = (_FRONT - span / 2, _FRONT + span / 2)
+        azimuth = (place.front - span / 2, place.front + span / 2)
         much = rng.uniform(0.3, 1.0, (5, _WAVES)) * np.array([0.06, 0.08, 0.05, 0.03, 0.03])[:, None]
         sway = np.stack([much, rng.uniform(1, 6, (5, _WAVES)), rng.uniform(0, 1, (5, _WAVES))], -1)
         jitter = float(rng.uniform(0.01, 0.03))

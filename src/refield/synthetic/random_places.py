@@ -63,6 +63,8 @@ class Place:
     faces_front: bool
     """whether something stands behind it, so that it is seen from the front only"""
     ground: str
+    front: float = -np.pi / 2
+    """radians: the azimuth from which it is seen"""
 
 
 _Furnish = Callable[[np.random.Generator, float], Place]
@@ -80,8 +82,8 @@ def draw_place(rng: np.random.Generator, *, outdoors: bool) -> Place:
     reach = float(rng.uniform(0.5, 1.2))
     kind, paint = random_textures.ground(rng, 1024 if outdoors else 768, outdoors=outdoors)
     make = {
-        "floor": _floor, "corner": _corner, "desk": _desk, "cluttered desk": _cluttered, "shelf": _shelf, "steps": _steps,
-        "slope": _rolling, "bowl": _rolling, "hills": _rolling,
+        "floor": _floor, "corner": _corner, "desk": _desk, "cluttered desk": _cluttered, "shelf": _shelf,
+        "steps": _steps, "slope": _rolling, "bowl": _rolling, "hills": _rolling,
     }[family]  # fmt: skip
     if make is _rolling:
         place = _rolling(rng, reach, family, paint)
@@ -118,7 +120,7 @@ def _square(reach: float, part: float) -> Patch:
 
 def _floor(rng: np.random.Generator, reach: float) -> Place:
     target = (0.0, 0.0, 0.15 * reach)
-    return Place("", (), (_square(reach, 0.8),), reach, target, 0.65 * reach, _AROUND, False, "")
+    return Place("", (), (_square(reach, 0.8),), reach, target, 0.85 * reach, _AROUND, False, "")
 
 
 def _corner(rng: np.random.Generator, reach: float) -> Place:
@@ -131,7 +133,7 @@ def _corner(rng: np.random.Generator, reach: float) -> Place:
         slab_item("side wall", (-far - _THICK, -long, 0), (-far, far, high), random_textures.wall(rng, 384)[1]),
     )
     target = (0.0, 0.0, 0.2 * reach)
-    return Place("", walls, (_square(reach, 0.75),), reach, target, 0.65 * reach, _FRONT, True, "")
+    return Place("", walls, (_square(reach, 0.75),), reach, target, 0.8 * reach, _FRONT, True, "", -np.pi / 4)
 
 
 def _desk(rng: np.random.Generator, reach: float) -> Place:
@@ -143,7 +145,7 @@ def _desk(rng: np.random.Generator, reach: float) -> Place:
     texture = random_textures.atlas(rng, solid, style, 256)
     desk = Item("desk", solid, texture, posed((0.0, 0.0, high / 2)))
     top = Patch((-0.95 * x, -0.95 * y), (0.95 * x, 0.95 * y), high)
-    return Place("", (desk,), (top,), reach, (0.0, 0.0, high + 0.15 * reach), 0.6 * reach, _AROUND, False, "")
+    return Place("", (desk,), (top,), reach, (0.0, 0.0, high + 0.15 * reach), 0.8 * reach, _AROUND, False, "")
 
 
 def _cluttered(rng: np.random.Generator, reach: float) -> Place:
@@ -201,7 +203,7 @@ def _steps(rng: np.random.Generator, reach: float) -> Place:
         items.append(slab_item(f"step {k}", (-1.5 * reach, low, k * rise), corner, paint))
         patches.append(Patch((-0.8 * reach, low), (0.8 * reach, low + tread), (k + 1) * rise))
     target = (0.0, 0.0, (count + 1) / 2 * rise + 0.15 * reach)
-    return Place("", tuple(items), tuple(patches), reach, target, 0.5 * reach, _FRONT, True, "")
+    return Place("", tuple(items), tuple(patches), reach, target, 0.6 * reach, _FRONT, True, "")
 
 
 def _rolling(rng: np.random.Generator, reach: float, family: str, paint: textures.Image) -> Place:
@@ -221,7 +223,7 @@ def _rolling(rng: np.random.Generator, reach: float, family: str, paint: texture
     ground = Item("ground", terrain, paint, posed((0.0, 0.0, 0.0)))
     patch = replace(_square(reach, 0.75), terrain=terrain)
     around = ("orbit", "half orbit", "hand-held", "dome")
-    return Place("", (ground,), (patch,), reach, (0.0, 0.0, low + 0.2 * reach), 0.6 * reach, around, False, "")
+    return Place("", (ground,), (patch,), reach, (0.0, 0.0, low + 0.2 * reach), 0.8 * reach, around, False, "")
 
 
 def in_room(rng: np.random.Generator, place: Place, wide: float, high: float) -> Place:
@@ -231,6 +233,7 @@ def in_room(rng: np.random.Generator, place: Place, wide: float, high: float) ->
     paints = [names[k % len(names)] for k in range(4)]
     white = np.full((8, 8, 3), 0.85, np.float32)
     have = {item.name for item in place.items}
+    floor = replace(place.items[0], solid=Box((wide, wide, t)))
     walls = [
         slab_item("room north", (-wide, wide, 0), (wide, wide + t, high), paints[0]),
         slab_item("room south", (-wide, -wide - t, 0), (wide, -wide, high), paints[1]),
@@ -238,4 +241,4 @@ def in_room(rng: np.random.Generator, place: Place, wide: float, high: float) ->
         slab_item("room west", (-wide - t, -wide, 0), (-wide, wide, high), paints[3]),
         slab_item("ceiling", (-wide, -wide, high), (wide, wide, high + t), white),
     ]
-    return replace(place, items=(*place.items, *(wall for wall in walls if wall.name not in have)))
+    return replace(place, items=(floor, *place.items[1:], *(wall for wall in walls if wall.name not in have)))

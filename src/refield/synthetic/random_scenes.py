@@ -15,6 +15,7 @@ from refield.synthetic.state import Item
 
 _SPOTS = 25  # places tried for one object
 _NOTHING = 0.1  # of the worlds
+_HOW_MANY = (0.55, 0.3, 0.15)  # of the others change 1, 2, 3 objects
 _PLACED_TIPPED, _PLACED_STACKED = 0.12, 0.12  # of the objects
 _KINDS = {"moved": 0.24, "slid": 0.1, "turned": 0.14, "tipped": 0.14, "stacked": 0.12, "swapped": 0.08,
           "removed": 0.1, "added": 0.08}  # fmt: skip
@@ -38,11 +39,25 @@ class Drawn:
     after: tuple[Item, ...]
     kinds: dict[str, str]
 
+    @property
+    def changed(self) -> list[str]:
+        """Names of the objects that something happened to."""
+        return [name for name, kind in self.kinds.items() if kind != "none"]
 
-def draw_things(rng: np.random.Generator, place: Place) -> tuple[Thing, ...] | None:
-    """1 to 6 objects, clear of each other and of the place; None where they did not fit."""
+
+def draw_kinds(rng: np.random.Generator) -> tuple[str, ...]:
+    """What is to happen, to an object each (swapped: to two); drawn once, so that what is hard is not rarer."""
+    if rng.random() < _NOTHING:
+        return ()
+    count = 1 + int(rng.choice(len(_HOW_MANY), p=_HOW_MANY))
+    return tuple(str(kind) for kind in rng.choice(list(_KINDS), count, p=list(_KINDS.values())))
+
+
+def draw_things(rng: np.random.Generator, place: Place, kinds: Sequence[str]) -> tuple[Thing, ...] | None:
+    """1 to 6 objects, enough for the changes, clear of each other and of the place; None where none fitted."""
     things: list[Thing] = []
-    for k in range(int(rng.integers(1, 7))):
+    least = len(kinds) + kinds.count("swapped") + ("stacked" in kinds)
+    for k in range(int(rng.integers(max(least, 1), max(least, 6) + 1))):
         size = place.largest * float(rng.uniform(0.4, 1.0))
         item, family, pattern = drawn_item(rng, f"object {k}", size)
         turn = None
@@ -88,58 +103,41 @@ def _bearing(items: Sequence[Item]) -> set[str]:
     """Names of the objects that others stand on: they are left alone."""
     out = set()
     for a in items:
-        low = a.box().numpy()
+        low, high = change.extent(a)
         for b in items:
-            box = b.box().numpy()
-            over = (low[0, :2] < box[1, :2]).all() and (low[1, :2] > box[0, :2]).all()
-            if a is not b and over and 0 <= low[0, 2] - box[1, 2] < 0.01:
+            theirs = change.extent(b)
+            over = (low[:2] < theirs[1, :2]).all() and (high[:2] > theirs[0, :2]).all()
+            if a is not b and over and abs(low[2] - theirs[1, 2]) < 0.01:
                 out.add(b.name)
     return out
 
 
-def draw_change(rng: np.random.Generator, place: Place, things: Sequence[Thing]) -> Drawn | None:
-    """1 to 3 objects changed, or nothing; None where what was drawn is not possible."""
-    kinds = {thing.item.name: "none" for thing in things}
+def draw_change(rng: np.random.Generator, place: Place, things: Sequence[Thing], kinds: Sequence[str]) -> Drawn | None:
+    """Objects changed in these ways; None where what was drawn is not possible."""
     items = {thing.item.name: thing.item for thing in things}
-    before, after = dict(items), dict(items)
-    free = [name for name in items if name not in _bearing(list(items.values()))]
-    nothing, wanted = rng.random() < _NOTHING, min(int(rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15])), len(free))
-    if nothing:
-        return Drawn(tuple(things), tuple(before.values()), tuple(after.values()), kinds)
-    names = [free[int(i)] for i in rng.permutation(len(free))]
-    while wanted > 0 and names:
-        name, kind = names.pop(), str(rng.choice(list(_KINDS), p=np.array(list(_KINDS.values()))))
-        wanted -= 1
+    before, after, told = dict(items), dict(items), dict.fromkeys(items, "none")
+    for kind in kinds:
+        bearing = _bearing(list(before.values())) | _bearing(list(after.values()))
+        free = [name for name in items if told[name] == "none" and name not in bearing]
+        if len(free) < 1 + (kind == "swapped"):
+            return None
+        name, *others = [free[int(i)] for i in rng.permutation(len(free))]
+        told[name] = kind
         if kind == "added":
             del before[name]
         elif kind == "removed":
             del after[name]
         elif kind == "swapped":
-            if not names:
+            told[others[0]] = kind
+            if not _swap(rng, place, after, name, others[0]):
                 return None
-            other = names.pop()
-            if not _swap(rng, place, after, name, other):
-                return None
-            kinds[other] = kind
-            wanted -= 1
         else:
             rest = [item for other, item in after.items() if other != name]
             new = _MOVES[kind](rng, after[name], rest, place)
             if new is None or not change.moved_enough(before[name], new):
                 return None
             after[name] = new
-        kinds[name] = kind
-    if not change.all_apart(list(after.values()), place.items[1:]) or _floats(before, kinds) or _floats(after, kinds):
-        return None
-    return Drawn(tuple(things), tuple(before.values()), tuple(after.values()), kinds)
-
-
-def _floats(items: dict[str, Item], kinds: dict[str, str]) -> bool:
-    """Whether an object stands on one that changes in another way than with it: what is stacked in ``kinds`` may."""
-    bearing = _bearing(list(items.values()))
-    return any(
-        kinds[name] not in ("none", "tipped", "turned", "slid", "moved", "stacked", "swapped") for name in bearing
-    )
+    return Drawn(tuple(things), tuple(before.values()), tuple(after.values()), told)
 
 
 def _moved(rng: np.random.Generator, item: Item, others: Sequence[Item], place: Place) -> Item | None:
@@ -167,19 +165,12 @@ def _slid(rng: np.random.Generator, item: Item, others: Sequence[Item], place: P
 def _under(item: Item, place: Place) -> change.Support | None:
     """The patch that it stands on; None where it stands on another object."""
     x, y = item.world_from_item[:2, 3].tolist()
-    foot = float(item.box()[0, 2])
-    lowest = foot + _depth(item)
+    lowest = float(change.extent(item)[0, 2])
     for patch in place.patches:
         inside = patch.low[0] <= x <= patch.high[0] and patch.low[1] <= y <= patch.high[1]
         if inside and abs(float(patch.heights(np.array(x), np.array(y))) - lowest) < 0.35 * max(item.solid.half):
             return patch
     return None
-
-
-def _depth(item: Item) -> float:
-    """How far the lowest vertex lies above the lowest corner of its own box."""
-    vertices = change.vertices_of(item.solid) @ change.rotation(item).T
-    return float(vertices[:, 2].min() + item.world_from_item[2, 3] - item.box()[0, 2])
 
 
 def _turned(rng: np.random.Generator, item: Item, others: Sequence[Item], place: Place) -> Item | None:

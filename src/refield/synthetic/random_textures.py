@@ -129,16 +129,16 @@ def ground(rng: np.random.Generator, size: int, *, outdoors: bool) -> tuple[str,
     kind = str(rng.choice(kinds))
     hue = float(rng.random())
     if kind in ("pavers", "bricks"):
-        return kind, textures.bricks(rng, size, 2 * int(rng.integers(6, 14)), hue, float(rng.uniform(0.5, 1.2)))
+        return kind, textures.bricks(rng, size, 2 * int(rng.integers(10, 24)), hue, float(rng.uniform(0.5, 1.2)))
     if kind == "wood":
-        return kind, textures.wood(rng, size, int(rng.integers(8, 18)), hue=0.05 + 0.06 * hue)
+        return kind, textures.wood(rng, size, int(rng.integers(16, 36)), hue=0.05 + 0.06 * hue)
     if kind == "tiles":
-        return kind, textures.tiles(rng, size, 2 * int(rng.integers(4, 9)), hue)
+        return kind, textures.tiles(rng, size, 2 * int(rng.integers(6, 16)), hue)
     paint, strength, finest = {
-        "grass": (textures.colour(0.2 + 0.12 * hue, 0.6, 0.42), 0.35, 64),
-        "gravel": (textures.colour(hue, 0.08, 0.55), 0.3, 48),
-        "sand": (textures.colour(0.1, 0.35, 0.72), 0.1, 24),
-        "carpet": (textures.colour(hue, 0.5, 0.5), 0.15, 40),
+        "grass": (textures.colour(0.2 + 0.12 * hue, 0.6, 0.42), 0.35, 160),
+        "gravel": (textures.colour(hue, 0.08, 0.55), 0.3, 120),
+        "sand": (textures.colour(0.1, 0.35, 0.72), 0.1, 90),
+        "carpet": (textures.colour(hue, 0.5, 0.5), 0.15, 90),
         "plain": (textures.colour(hue, 0.12, 0.66), 0.02, 8),
     }[kind]
     grain = textures.noise(rng, (size, size), (finest, finest), 2) + 0.5 * textures.noise(rng, (size, size), (6, 6), 3)

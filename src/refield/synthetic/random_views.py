@@ -10,16 +10,20 @@ import torch
 from torch import Tensor
 
 from refield.scene.camera import Camera
+from refield.scene.capture import camera_rays
+from refield.scene.pose import invert, rotate, transform
 from refield.synthetic.random_scenes import Drawn
-from refield.synthetic.state import Item, State
+from refield.synthetic.state import Item, State, Triple
 from refield.synthetic.visibility import view_hits
 
 _WIDE = 40  # pixels, the longer side of the views that are tested
-_SHOWN = 0.004  # of the picture: 65 pixels of 128 x 128
+_SHOWN = 0.006  # of the picture: 98 pixels of 128 x 128
 _CLEAR = 0.25  # of an object's outline, that must be in sight
 _LARGEST = 0.3  # of the picture that an object may fill on the average
 _BEFORE_LENS = 0.12  # of the distance to the target: nothing may be nearer
+_BEFORE_TARGET = 0.7  # of the way to the target, that must be free
 _OLD_SHARE = 0.35  # of the old views that must show a changed object
+_PAINT, _OTHERWISE = 3.0, 0.15  # how much paint counts beside outline; what is needed of both
 _KEPT_SHARE = 0.15  # ... and one that stays
 
 
@@ -32,6 +36,7 @@ class Views:
     new: list[Tensor]
     evaluation: list[Tensor]
     distance: float
+    target: Triple = (0.0, 0.0, 0.0)
 
     @property
     def all(self) -> list[Tensor]:
@@ -46,10 +51,18 @@ class Views:
         return torch.stack([view_hits(state, self.small, pose).depth for pose in self.all])
 
     def clear(self, fixed: Tensor) -> bool:
-        """Whether no camera stands in or close before something, and the ground is seen in most."""
+        """Whether no camera stands in or close before something, and each has the target in sight."""
         there = fixed.isfinite().double().mean((1, 2))
         near = fixed.flatten(1).amin(1) > _BEFORE_LENS * self.distance
-        return bool(near.all()) and bool((there > 0.3).double().mean() > 0.7)
+        sight = [self._in_sight(pose, depth) for pose, depth in zip(self.all, fixed)]
+        return bool(near.all()) and all(sight) and bool((there > 0.3).double().mean() > 0.7)
+
+    def _in_sight(self, pose: Tensor, depth: Tensor) -> bool:
+        small, to = self.small, transform(invert(pose), torch.tensor([self.target], dtype=torch.float64))
+        pixel, z = small.project(to)
+        column, row = (int(v) for v in pixel[0].floor())
+        inside = float(z) > 0 and 0 <= column < small.width and 0 <= row < small.height
+        return inside and float(depth[row, column]) > _BEFORE_TARGET * float(to.norm())
 
 
 def seen_by(views: Views, fixed: Tensor, drawn: Drawn) -> dict[str, dict[str, float]] | None:
@@ -84,8 +97,40 @@ def seen_by(views: Views, fixed: Tensor, drawn: Drawn) -> dict[str, dict[str, fl
                 shown[looks].sum() / whole[looks].sum().clamp_min(1e-9)
             )
         out[name] = facts
+    pairs = [[{i.name: i for i in items}.get(name) for _, items in _both(drawn)] for name in drawn.changed]
+    if not all(differs(views, old, new) for old, new in pairs if old is not None and new is not None):
+        return None
     nearest = torch.stack(list(depths.values())).flatten(2).amin((0, 2))
     return out if bool((nearest > _BEFORE_LENS * views.distance).all()) else None
+
+
+def differs(views: Views, old: Item, new: Item) -> bool:
+    """Whether two of the new photos would show an object otherwise, by its outline or its paint."""
+    changed = 0
+    for pose in views.new:
+        (there, was), (here, now) = (_painted(views, item, pose) for item in (old, new))
+        both, either = there & here, there | here
+        overlap = float(both.sum() / either.sum().clamp_min(1))
+        paint = float((was - now).abs()[both].mean()) if bool(both.any()) else 0.0
+        changed += bool(either.any()) and 1 - overlap + _PAINT * overlap * paint > _OTHERWISE
+    return changed >= 2
+
+
+def _painted(views: Views, item: Item, pose: Tensor) -> tuple[Tensor, Tensor]:
+    """Where an item alone is seen (H, W), and its texture there (H, W, 3)."""
+    camera = views.small
+    rays = camera_rays(camera, pose)
+    item_from_world = invert(item.world_from_item)
+    origins = transform(item_from_world, rays.origins.double())
+    directions = rotate(item_from_world, rays.directions.double())
+    t = item.solid.hit(origins, directions)
+    there = t.isfinite()
+    out = torch.zeros(len(t), 3)
+    uv = item.solid.uv(origins[there] + t[there, None] * directions[there])
+    height, width = item.texture.shape[:2]
+    row, column = (uv[:, 1] * height).long().clamp(0, height - 1), (uv[:, 0] * width).long().clamp(0, width - 1)
+    out[there] = torch.from_numpy(item.texture)[row, column]
+    return there.reshape(camera.height, camera.width), out.reshape(camera.height, camera.width, 3)
 
 
 def _both(drawn: Drawn) -> tuple[tuple[str, Sequence[Item]], tuple[str, Sequence[Item]]]:

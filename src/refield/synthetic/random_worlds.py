@@ -14,12 +14,13 @@ import numpy as np
 from torch import Tensor
 
 from refield.scene.camera import Camera
+from refield.scene.errors import InputError
 from refield.synthetic.disturb import Disturbance
 from refield.synthetic.random_light import Light, lamps, sky, studio
 from refield.synthetic.random_objects import FAMILIES
 from refield.synthetic.random_paths import CameraPath, draw_camera, draw_path
 from refield.synthetic.random_places import Place, draw_place, in_room
-from refield.synthetic.random_scenes import Thing, draw_change, draw_things
+from refield.synthetic.random_scenes import Thing, draw_change, draw_kinds, draw_things
 from refield.synthetic.random_views import Views, seen_by
 from refield.synthetic.state import State, World
 
@@ -53,18 +54,18 @@ def random_world(seed: int, photos: int | None = None) -> RandomWorld:
     """The world of a seed; ``photos`` old ones, or as many as the seed says.
 
     Raises:
-        RuntimeError: nothing was found in a great many draws.
+        InputError: nothing fitted in a great many draws.
     """
     rng = np.random.default_rng([seed, *b"random"])
     count, brightness = int(rng.integers(_LEAST, _MOST + 1)), float(rng.uniform(0.36, 0.48))
-    disturbance = _disturbance(rng, seed)
+    disturbance, kinds = _disturbance(rng, seed), draw_kinds(rng)
     for _ in range(_PLACES):
         frame = _frame(rng)
-        found = _scene(rng, frame)
+        found = _scene(rng, frame, kinds)
         if found is not None:
             break
     else:
-        raise RuntimeError(f"seed {seed}: no world in {_PLACES} places")
+        raise InputError(f"--seed {seed}", f"nothing fitted in {_PLACES} places", "take another seed")
     place, light, camera, path, views = frame
     things, changes, before, after, seen = found
     world = World("random", before, after, place.target)
@@ -97,7 +98,14 @@ def _frame(rng: np.random.Generator) -> _Frame:
     setting = str(rng.choice(["room", "studio", "outdoors"], p=[0.4, 0.15, 0.45]))
     place, camera = draw_place(rng, outdoors=setting == "outdoors"), draw_camera(rng)
     path = draw_path(rng, place, camera)
-    views = Views(camera, path.poses(rng, _TESTED), path.new_poses(rng, NEW), path.new_poses(rng, NEW), path.distance)
+    views = Views(
+        camera,
+        path.poses(rng, _TESTED),
+        path.new_poses(rng, NEW),
+        path.new_poses(rng, NEW),
+        path.distance,
+        place.target,
+    )
     eyes = np.stack([pose[:3, 3].numpy() for pose in views.all])
     if setting == "room":
         wide = float(np.abs(eyes[:, :2]).max()) + float(rng.uniform(0.3, 1.0))
@@ -107,7 +115,7 @@ def _frame(rng: np.random.Generator) -> _Frame:
     return place, sky(rng) if setting == "outdoors" else studio(rng), camera, path, views
 
 
-def _scene(rng: np.random.Generator, frame: _Frame) -> _Scene | None:
+def _scene(rng: np.random.Generator, frame: _Frame, kinds: Sequence[str]) -> _Scene | None:
     """Objects and changes that fit and are seen; None after many draws."""
     place, light, _, _, views = frame
     empty = State(place.items, light.surroundings)
@@ -115,10 +123,10 @@ def _scene(rng: np.random.Generator, frame: _Frame) -> _Scene | None:
     if not views.clear(fixed):
         return None
     for _ in range(_SCENES):
-        things = draw_things(rng, place)
+        things = draw_things(rng, place, kinds)
         if things is None:
             continue
-        drawn = draw_change(rng, place, things)
+        drawn = draw_change(rng, place, things, kinds)
         if drawn is None:
             continue
         before, after = (

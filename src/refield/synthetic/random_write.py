@@ -30,6 +30,7 @@ from refield.synthetic.write import Progress, SynthConfig, shoot_state, true_cha
 
 _METERED, _METER_PIXELS, _METER_PATHS = 6, 32, 64  # photos that the exposure is metered on, their size, their paths
 _DARKLY = 1e-4  # of the light: for metering
+_CLEANER = 4  # times as many paths a pixel for the photos of evaluation: half the noise
 _LATER = 1_000_003  # to the disturbance's seed, for the later visit
 _ROUNDS = 30  # of halving the interval of the factor's logarithm
 
@@ -47,14 +48,14 @@ def write_random(out: Path, config: SynthConfig, on_progress: Progress | None = 
     world = replace(drawn.world, before=before, after=after)
     total, done = len(drawn.old) + len(drawn.new) + len(drawn.evaluation), 0
 
-    def shoot(folder: str, state: State, poses: Sequence[Tensor]) -> Capture:
+    def shoot(folder: str, state: State, poses: Sequence[Tensor], spp: int = config.spp) -> Capture:
         nonlocal done
         first, done = done, done + len(poses)
         tell = None if on_progress is None else lambda k: on_progress(first + k, total)
-        return shoot_state(state, out / folder, (camera, poses), (config.spp, config.seed * 100_003 + first), tell)
+        return shoot_state(state, out / folder, (camera, poses), (spp, config.seed * 100_003 + first), tell)
 
     old, new = shoot("before", before, drawn.old), shoot("after", after, drawn.new)
-    evaluation = shoot("eval", after, drawn.evaluation)
+    evaluation = shoot("eval", after, drawn.evaluation, _CLEANER * config.spp)
     for folder, capture in (("after", new), ("eval", evaluation)):
         write_masks(world, out / folder, capture)
     (out / "truth").mkdir(exist_ok=True)

@@ -43,6 +43,8 @@ class Solid(Protocol):
 
     def mesh(self) -> Mesh: ...
 
+    def __hash__(self) -> int: ...
+
 
 @dataclass(frozen=True)
 class Box:

@@ -18,8 +18,8 @@ from refield.synthetic.shapes import _INSET, Box, Mesh, Sphere
 
 Point = tuple[float, float, float]
 
-_STEPS = 400  # of a traced ray, at most; one in thousands grazes a surface for so long
-_NEAR = 1e-9  # metres from a surface at which a traced ray has met it
+_STEPS = 3000  # of a traced ray, at most: one that grazes a surface nears it by ever smaller steps
+_NEAR = 1e-7  # metres from a surface at which a traced ray has met it
 _SAME_PLANE = 1e-7
 _ACROSS = 12  # cells a side of a rounded face's mesh
 
@@ -167,7 +167,8 @@ class Convex:
         return torch.stack([u, v], -1)
 
     def mesh(self) -> Mesh:
-        vertices, uv, triangles, start = [], [], [], 0
+        vertices, uv, start = [], [], 0
+        triangles: list[list[int]] = []
         for i, face in enumerate(self.faces):
             count = len(face.corners)
             vertices.append(face.corners)
@@ -236,7 +237,8 @@ class RoundedBox:
         i = np.arange(_ACROSS * (_ACROSS + 1)).reshape(_ACROSS, -1)[:, :-1].ravel()
         quads = np.stack([i, i + _ACROSS + 1, i + _ACROSS + 2, i + 1], -1)
         half, inner = np.array(self.half), np.array(self.half) - self.radius
-        vertices, uv, faces = [], [], []
+        vertices: list[NDArray[np.float64]] = []
+        uv, faces = [], []
         for axis in range(3):
             for sign in (-1, 1):
                 cube = np.empty((len(first), 3))

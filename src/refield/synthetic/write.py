@@ -41,7 +41,7 @@ class SynthConfig:
     """How a world is photographed."""
 
     size: int = 128
-    """pixels a side"""
+    """pixels a side; the longer one of the world random"""
     spp: int = 64
     """light paths a pixel"""
     cameras: int | None = None
