@@ -21,6 +21,7 @@ MAY_IMPORT = {
     "evaluate": {"scene", "field", "vision"},
     "report": {"scene", "field", "vision"},
     "baselines": {"scene", "field", "vision", "update"},  # learns from what the update's supervision leaves
+    "rehearse": {"scene", "field", "synthetic"},
     "check": {"scene", "field", "vision", "photos"},
     "history": {"scene", "field", "update", "workspace", "artefacts"},
     "cli": {"scene", "commands"},

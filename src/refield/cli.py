@@ -24,6 +24,7 @@ COMMANDS = {
     "undo": "take the last update back",
     "render": "pictures from any camera, before or after",
     "evaluate": "PSNR and SSIM on photos the field has never seen",
+    "rehearse": "known changes put into a workspace's own photos: what an update is worth there",
     "synth": "path-trace a world that is known exactly (needs the extra 'synth')",
 }
 INPUT, INTERRUPTED = 2, 130

@@ -28,6 +28,9 @@ class Synth:
     """the world's name, or random: all of it drawn from --seed; an unknown one lists them all"""
     out: Annotated[Path, arg(metavar="OUT"), Positional]
     """the folder for before/, after/, eval/ and truth/"""
+    into: Path | None = None
+    """a workspace: the world is ``random``, and its objects are put into the photos of that (needs no Mitsuba); of the
+    options below only the seed counts"""
     overwrite: bool = False
     """write into a folder that is not empty"""
     config: OmitArgPrefixes[SynthConfig] = field(default_factory=SynthConfig)
@@ -36,6 +39,9 @@ class Synth:
 def run(options: Synth) -> None:
     clock = Clock()
     _refuse_unless_free(options.out, overwrite=options.overwrite)
+    if options.into is not None:
+        _into(options, options.into, clock)
+        return
     clock.stage(f"path-trace {options.world}")
     _refuse_the_others_options(options)
     with writable(options.out), clock.counting("photos") as count:
@@ -47,6 +53,24 @@ def run(options: Synth) -> None:
             write_world(options.world, options.out, **told, on_progress=count)
     clock.stop()
     print(f"{options.world} is in {options.out} ({clock.total:.0f} s)")
+
+
+def _into(options: Synth, work: Path, clock: Clock) -> None:
+    """Put objects into the photos of a workspace."""
+    from refield.commands.rehearse import opened
+    from refield.rehearse.compose import compose, scenery_of
+
+    if options.world != RANDOM:
+        raise InputError("--into", f"does not go with the world {options.world!r}", "give the world 'random'")
+    workspace = opened(work)
+    clock.stage("find out how far off things are")
+    with clock.counting("views") as count:
+        scenery = scenery_of(workspace.field(), workspace.capture(), count)
+    clock.stage("put objects into the photos")
+    with writable(options.out), clock.counting("photos") as count:
+        plan = compose(scenery, options.out, options.config.seed, count)
+    clock.stop()
+    print(f"{plan.facts['happening']}: {options.out} ({clock.total:.0f} s)")
 
 
 def _refuse_the_others_options(options: Synth) -> None:

@@ -60,7 +60,7 @@ class AnalyticField:
             mine = owner == i
             if bool(mine.any()):
                 uv = item.solid.uv(transform(self._poses[i], x[mine]))
-                rgb = rgb.masked_scatter(mine[..., None].expand_as(x), _looked_up(self._textures[i], uv))
+                rgb = rgb.masked_scatter(mine[..., None].expand_as(x), looked_up(self._textures[i], uv))
         return self._density(nearest), rgb
 
     def _distances(self, x: Tensor) -> Tensor:
@@ -82,7 +82,7 @@ class AnalyticField:
         return torch.cat(near).to(torch.uint8).reshape(r, r, r)
 
 
-def _looked_up(texture: Tensor, uv: Tensor) -> Tensor:
+def looked_up(texture: Tensor, uv: Tensor) -> Tensor:
     """Bilinear, texel centres at (i + 0.5) / size. texture (1, 3, H, W), uv (K, 2) -> (K, 3)."""
     grid = (uv * 2 - 1)[None, None].to(texture.dtype)
     found = functional.grid_sample(texture, grid, mode="bilinear", padding_mode="border", align_corners=False)

@@ -32,6 +32,8 @@ CAMERAS = 180
 """old photos, unless told otherwise (§11.1)"""
 Progress = Callable[[int, int], None]
 """Called with the pictures done and their number."""
+Seen = Callable[[State, Frame], Tensor]
+"""Which item of a state each pixel's centre of a photo shows, (H, W) int64, -1 for none."""
 
 
 @dataclass(frozen=True)
@@ -127,12 +129,15 @@ def shoot_state(
     return capture
 
 
-def true_change(world: World, before: Capture, frames: Sequence[Frame]) -> SceneChange:
+def _alone(state: State, frame: Frame) -> Tensor:
+    """What a photo shows of a world in which there is nothing else."""
+    return seen_items(state, frame.camera, frame.world_from_cam)
+
+
+def true_change(world: World, before: Capture, frames: Sequence[Frame], seen: Seen = _alone) -> SceneChange:
     """What `estimate` should find: masks as in ``before.train``, and the new photos all used."""
-    then, now = (
-        [seen_items(state, f.camera, f.world_from_cam) for f in before.train] for state in (world.before, world.after)
-    )
-    pairs = [masks(world, f.camera, f.world_from_cam) for f in frames]
+    then, now = ([seen(state, f) for f in before.train] for state in (world.before, world.after))
+    pairs = [masks_of(world, f, seen) for f in frames]
     return SceneChange(
         objects=tuple(_object_change(world, change, then, now) for change in world.changes),
         photos=tuple(PlacedPhoto(frame.name, "used", frame=frame) for frame in frames),
@@ -151,6 +156,11 @@ def masks(world: World, camera: Camera, world_from_cam: Tensor) -> tuple[Tensor,
     """Move-in (what arrived, visible now) and move-out (what was there, visible then), (H, W) bool each."""
     then, now = (seen_items(state, camera, world_from_cam) for state in (world.before, world.after))
     return _masks(world, then, now)
+
+
+def masks_of(world: World, frame: Frame, seen: Seen) -> tuple[Tensor, Tensor]:
+    """`masks` of a photo, by what it shows."""
+    return _masks(world, seen(world.before, frame), seen(world.after, frame))
 
 
 def _masks(world: World, then: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:

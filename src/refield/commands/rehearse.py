@@ -1,0 +1,240 @@
+"""``refield rehearse WORK``: known changes put into a workspace's own photos; what an update is worth there."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from rich.table import Table
+from tyro.conf import Positional, arg
+
+from refield.artefacts import writable
+from refield.check.survey import survey_capture
+from refield.commands.clock import Clock, results
+from refield.commands.train import Sources, train
+from refield.commands.update import Update, Visit, update
+from refield.evaluate import Report
+from refield.field.fit import FitConfig
+from refield.rehearse.compose import Scenery, compose, scenery_of
+from refield.rehearse.score import ChangeScore, score_change
+from refield.scene.change_files import load_change
+from refield.scene.errors import InputError
+from refield.scene.files import read_json, write_json
+from refield.scene.world import world_of
+from refield.workspace import Workspace
+
+REPORT = "rehearsals.json"
+_MOST = 100
+
+
+@dataclass(frozen=True)
+class Rehearse:
+    """Put known objects and changes into a workspace's own photos, train and update on them, and tell how well it went.
+
+    The workspace stays as it is. Each rehearsal takes about as long as a training and an update.
+    """
+
+    work: Annotated[Path, arg(metavar="WORK"), Positional]
+    """the workspace whose photos are used"""
+    seeds: str = "0..2"
+    """which rehearsals: a number, or from..to; seed 0 moves an object, 1 adds one, 2 removes one, 3 changes several,
+    4 turns one, 5 tips one over, 6 changes nothing, and so on round and round"""
+    out: Path | None = None
+    """an empty folder for the photos, workspaces and numbers of the rehearsals; without it only the table is told"""
+    placed: bool = True
+    """the new photos come with their poses; --no-placed has them placed by what they show, as photos of your own are"""
+    fit: FitConfig = field(default_factory=FitConfig)
+
+
+@dataclass(frozen=True)
+class Rehearsed:
+    """One rehearsal's outcome."""
+
+    seed: int
+    facts: dict[str, Any]
+    psnr: float
+    """of the field fitted to the photos before, on held-out pixels, dB"""
+    change: ChangeScore | None
+    """None: the update was refused"""
+    evaluation: Report | None
+    refused: str
+    seconds: float
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "seed": self.seed,
+            "facts": self.facts,
+            "held_out_psnr": self.psnr if math.isfinite(self.psnr) else None,
+            "change": None if self.change is None else self.change.to_dict(),
+            "evaluation": None if self.evaluation is None else self.evaluation.to_dict(),
+            "refused": self.refused,
+            "seconds": self.seconds,
+        }
+
+
+def run(options: Rehearse) -> None:
+    seeds, clock = seeds_of(options.seeds), Clock()
+    scenery, size = prepared(options.work, clock, options.fit, len(seeds))
+    done: list[Rehearsed] = []
+    with _folder(options.work, options.out) as folder:
+        for seed in seeds:
+            with _whole(folder / f"{seed:03d}") as place:
+                done.append(rehearsed(scenery, place, seed, clock, options))
+            if options.out is not None:  # after each, so that what is done is kept whatever comes
+                write_json(options.out / REPORT, _record(done, size))
+            left = (len(seeds) - len(done)) * sum(r.seconds for r in done) / len(done)
+            if left:
+                clock.console.print(f"           {len(done)} of {len(seeds)} rehearsed, about {_time(left)} left")
+    clock.stop()
+    results().print(table(done, size))
+
+
+def prepared(work: Path, clock: Clock, fit: FitConfig, count: int) -> tuple[Scenery, float]:
+    """A workspace as a scenery, and how large its world is; tells how long the rehearsals will take.
+
+    Raises:
+        InputError: it is no workspace, or has too few photos.
+    """
+    workspace = opened(work)
+    capture = workspace.capture()
+    seconds = sum(survey_capture(capture, fit).seconds.values())
+    each = f"each about one training (some {_time(seconds)} on this machine) and one update"
+    clock.console.print(f"{count} rehearsals, {each}; Ctrl-C leaves nothing half done", markup=False)
+    clock.stage("find out how far off things are")
+    with clock.counting("views") as tell:
+        return scenery_of(workspace.field(), capture, tell), world_of(capture).size
+
+
+def opened(work: Path) -> Workspace:
+    """The workspace whose photos things are put into.
+
+    Raises:
+        InputError: it is none; a capture without a field lacks depth.
+    """
+    try:
+        return Workspace.open(work)
+    except InputError as error:
+        if not work.exists():
+            raise
+        what = "is no workspace: how far off things are in its photos is not known"
+        raise InputError(work, what, f"train it first: refield train {work} WORK, then give WORK") from error
+
+
+def rehearsed(scenery: Scenery, folder: Path, seed: int, clock: Clock, options: Rehearse) -> Rehearsed:
+    """Composite, fit, update and score one rehearsal in ``folder``, by what the commands call."""
+    began = clock.total
+    clock.stage(f"rehearsal {seed}: put objects into the photos")
+    data, work = folder / "data", folder / "work"
+    with writable(folder), clock.counting("photos") as tell:
+        compose(scenery, data, seed, tell)
+    psnr = train(Sources(data / "before", work), clock, options.fit, overwrite=False)
+    photos = data / "after" if options.placed else data / "after" / "images"
+    visit: Visit | None = None
+    refused = ""
+    try:
+        visit = update(Update(work, photos, evaluation=data / "eval"), clock)
+    except InputError as error:
+        refused = str(error)
+        clock.warn(f"the update was refused: {refused}")
+    clock.stop()
+    truth = load_change(data / "truth", masks=False)
+    score = None if visit is None else score_change(visit.change, truth)
+    evaluation = None if visit is None else visit.evaluation
+    facts = read_json(data / "truth" / "world.json")
+    return Rehearsed(seed, facts, psnr, score, evaluation, refused, clock.total - began)
+
+
+def seeds_of(text: str) -> list[int]:
+    """``7``, or ``from..to``, both of them too.
+
+    Raises:
+        InputError: it is neither.
+    """
+    found = re.fullmatch(r"(\d{1,9})(?:\.\.(\d{1,9}))?", text.strip())
+    if found is None or int(found[2] or found[1]) < int(found[1]):
+        raise InputError("--seeds", f"{text!r} is no number and no from..to", "give 3, or 0..2")
+    seeds = list(range(int(found[1]), int(found[2] or found[1]) + 1))
+    if len(seeds) > _MOST:
+        raise InputError("--seeds", f"names {len(seeds)} rehearsals", f"give {_MOST} at most")
+    return seeds
+
+
+def table(done: Sequence[Rehearsed], size: float) -> Table:
+    """One row a rehearsal."""
+    out = Table(title="what to expect here (in brackets: the field before the update)")
+    for column in ("seed", "happened", "found", "shift off", "of scene", "turn off", "PSNR-in", "-out", "untouched"):
+        out.add_column(column, justify="left" if column in ("happened", "found") else "right")
+    for r in done:
+        shifts = [o for o in r.change.objects if o.shift_error is not None] if r.change else []
+        worst = max((o.shift_error or 0.0 for o in shifts), default=None)
+        turn = max((o.turn_error_deg or 0.0 for o in shifts), default=None)
+        out.add_row(
+            str(r.seed), _happened(r), _found(r),
+            "-" if worst is None else f"{worst:.3g}",
+            "-" if worst is None or size <= 0 else f"{100 * worst / size:.2f} %",
+            "-" if turn is None else f"{turn:.1f}°",
+            *(_decibels(r.evaluation, region) for region in ("psnr_in", "psnr_out", "psnr_untouched")),
+        )  # fmt: skip
+    right = sum(r.change is not None and r.change.all_right for r in done)
+    out.caption = f"{right} of {len(done)} rehearsals with every change told rightly and none besides"
+    return out
+
+
+def _happened(r: Rehearsed) -> str:
+    return f"{r.facts['happening']} ({', '.join(r.facts['changes'])})" if r.facts["changes"] else "nothing"
+
+
+def _found(r: Rehearsed) -> str:
+    if r.change is None:
+        return "refused"
+    told = [o.found or "not found" for o in r.change.objects] + [f"{kind} besides" for kind in r.change.extra]
+    return ", ".join(told) or "nothing"
+
+
+def _decibels(report: Report | None, region: str) -> str:
+    if report is None:
+        return "-"
+    scores = [getattr(s, region) for s in (report.pooled, report.pooled_before) if s is not None]
+    shown = ["-" if v is None else f"{v:.1f}" for v in scores]
+    return shown[0] if len(shown) == 1 else f"{shown[0]} ({shown[1]})"
+
+
+def _record(done: Sequence[Rehearsed], size: float) -> dict[str, Any]:
+    return {"scene_size": size, "rehearsals": [r.to_dict() for r in done]}
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+@contextlib.contextmanager
+def _whole(folder: Path) -> Iterator[Path]:
+    """A folder that is removed if what fills it does not come to its end."""
+    try:
+        yield folder
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+@contextlib.contextmanager
+def _folder(work: Path, out: Path | None) -> Iterator[Path]:
+    """``out``, which must be empty and lie outside of the workspace; without it a folder that vanishes."""
+    if out is None:
+        with tempfile.TemporaryDirectory(prefix="refield-") as scratch:
+            yield Path(scratch)
+        return
+    if out.resolve().is_relative_to(work.resolve()):
+        raise InputError(out, "lies in the workspace, which stays as it is", "choose a folder outside of it")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(out, "is not an empty folder", "choose another output folder")
+    with writable(out):
+        out.mkdir(parents=True, exist_ok=True)
+    yield out

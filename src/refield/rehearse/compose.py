@@ -1,0 +1,210 @@
+"""A scene's photos with known objects and a known change put into them: ``before/ after/ eval/ truth/``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refield.field.radiance import Field
+from refield.rehearse.plan import Plan, plan_of
+from refield.rehearse.spots import sites_of
+from refield.rehearse.surfaces import Standing, Surfaces, View, depth_in, surfaces_of
+from refield.scene.capture import Capture, Frame
+from refield.scene.change_files import save_change
+from refield.scene.errors import InputError
+from refield.scene.files import write_json
+from refield.scene.images import frame_image, scaled_image, write_image
+from refield.scene.pose import invert, transform
+from refield.scene.transforms_json import save_transforms
+from refield.scene.world import world_of
+from refield.synthetic.insert import Inserted, Shot, inserted, seen_in
+from refield.synthetic.looks import gain_of, look_of
+from refield.synthetic.shading import CastShadow
+from refield.synthetic.state import State
+from refield.synthetic.write import masks_of, true_change
+
+Count = Callable[[int, int], None]
+
+NEW = 4
+"""photos of the new state, and as many to measure by"""
+FEWEST = 20
+"""photos that a capture must have to be rehearsed in"""
+
+
+@dataclass(frozen=True)
+class Divided:
+    """A capture's photos: of before the change, of after it, and to measure by."""
+
+    before: tuple[Frame, ...]
+    after: tuple[Frame, ...]
+    evaluation: tuple[Frame, ...]
+
+
+def divided(capture: Capture) -> Divided:
+    """Every so-many-th photo shows the new state, one half-way between two of these is measured by.
+
+    Raises:
+        InputError: there are too few.
+    """
+    frames, count = capture.frames, len(capture.frames)
+    if count < FEWEST:
+        raise InputError("the capture", f"has {count} photos", f"a rehearsal needs {FEWEST} or more")
+    after = [int((i + 0.25) * count / NEW) for i in range(NEW)]
+    evaluation = [int((i + 0.75) * count / NEW) for i in range(NEW)]
+    rest = tuple(f for i, f in enumerate(frames) if i not in after and i not in evaluation)
+    return Divided(rest, tuple(frames[i] for i in after), tuple(frames[i] for i in evaluation))
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """A scene in which things can be rehearsed."""
+
+    field: Field
+    capture: Capture
+    photos: Divided
+    surfaces: Surfaces
+    up: Tensor
+    """(3,) float64"""
+
+
+def scenery_of(field: Field, capture: Capture, on_progress: Count | None = None) -> Scenery:
+    """Of a field and the photos it was fitted to: found once, for any number of rehearsals.
+
+    Raises:
+        InputError: there are too few photos.
+    """
+    photos = divided(capture)
+    up = torch.tensor(world_of(capture).up, dtype=torch.float64)
+    surfaces = surfaces_of(field, capture.frames, up, on_progress)
+    if len(surfaces.points) == 0:
+        raise InputError("the field", "shows nothing solid from where its photos were taken", "train it again")
+    return Scenery(field, capture, photos, surfaces, up)
+
+
+def compose(scenery: Scenery, out: Path, seed: int, on_progress: Count | None = None) -> Plan:
+    """Write a rehearsal into the folder ``out``. Everything random is from ``seed``.
+
+    Raises:
+        InputError: there is no free place that enough photos see.
+    """
+    photos, surfaces = scenery.photos, scenery.surfaces
+    views = {id(view.frame): view for view in surfaces.views}
+
+    def group(frames: Sequence[Frame]) -> list[View]:
+        return [views[id(frame)] for frame in frames]
+
+    groups = (group(photos.before), group(photos.after), group(photos.evaluation))
+    plan = plan_of(sites_of(surfaces, scenery.up, groups, seed), seed)
+    studio = _Studio(scenery, plan)
+    world, total, done = plan.world, len(scenery.capture.frames), 0
+    captures = {}
+    for folder, frames, state in (
+        ("before", photos.before, world.before),
+        ("after", photos.after, world.after),
+        ("eval", photos.evaluation, world.after),
+    ):
+        first, done = done, done + len(frames)
+        tell = None if on_progress is None else partial(_tell, on_progress, first, total)
+        captures[folder] = studio.photograph(out / folder, frames, state, tell)
+    for folder in ("after", "eval"):
+        studio.write_masks(out / folder, captures[folder])
+    (out / "truth").mkdir(exist_ok=True)
+    save_change(out / "truth", true_change(world, captures["before"], captures["after"].frames, studio.seen))
+    write_json(out / "truth" / "world.json", plan.facts | _size(captures))
+    return plan
+
+
+def _tell(on_progress: Count, first: int, total: int, done: int) -> None:
+    on_progress(first + done, total)
+
+
+def _size(captures: dict[str, Capture]) -> dict[str, Any]:
+    world = world_of(captures["before"])
+    return {"scene_size": world.size, "photos": {name: len(c.frames) for name, c in captures.items()}}
+
+
+class _Studio:
+    """Puts a plan's objects into photos, and remembers what each shows of which."""
+
+    def __init__(self, scenery: Scenery, plan: Plan) -> None:
+        self._scenery, self._plan, site = scenery, plan, plan.site
+        self._standing, plane = None, None
+        if site.offset is not None:
+            self._standing = Standing(site.up, site.offset, 2 * site.even)
+            plane = (site.up, site.offset, 2 * site.even)
+        self._shadow = {s: CastShadow(state, plan.light, plane) for s, state in self._states()}
+        self._taken: dict[Path, Frame] = {}
+        self._seen: dict[tuple[Path, str], Inserted] = {}
+
+    def _states(self) -> tuple[tuple[str, State], tuple[str, State]]:
+        return ("before", self._plan.world.before), ("after", self._plan.world.after)
+
+    def photograph(
+        self, folder: Path, frames: Sequence[Frame], state: State, tell: Callable[[int], None] | None
+    ) -> Capture:
+        """Write the photos of a state (transforms.json, images/)."""
+        name = next(n for n, s in self._states() if s is state)
+        kept = []
+        for i, frame in enumerate(frames):
+            path = folder / "images" / f"{i:04d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._taken[path] = frame
+            shot = self._shot(frame)
+            picture = inserted(shot, state, self._plan.light, self._shadow[name], seed=i)
+            write_image(path, picture.image)
+            self._seen[path, name] = replace(picture, image=torch.zeros(0))  # many photos are large
+            kept.append(replace(frame, path=path, name=f"images/{path.name}"))
+            if tell is not None:
+                tell(i + 1)
+        capture = Capture(tuple(kept))
+        save_transforms(folder / "transforms.json", capture)
+        return capture
+
+    def write_masks(self, folder: Path, capture: Capture) -> None:
+        """``masks_in/``, ``masks_out/`` and ``depth/`` of photos of the new state."""
+        for kind in ("masks_in", "masks_out", "depth"):
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+        for frame in capture.frames:
+            now, then = masks_of(self._plan.world, frame, self.seen)
+            write_image(folder / "masks_in" / frame.path.name, now)
+            write_image(folder / "masks_out" / frame.path.name, then)
+            depth = self._picture(frame, "after").depth
+            np.savez_compressed(folder / "depth" / f"{frame.path.stem}.npz", depth=depth.numpy())
+
+    def seen(self, state: State, frame: Frame) -> Tensor:
+        """Which item of a state each pixel of a photo would show, (H, W) int64, -1 for none: the truth's `Seen`."""
+        return self._picture(frame, next(n for n, s in self._states() if s is state)).item
+
+    def _picture(self, frame: Frame, label: str) -> Inserted:
+        key = (frame.path, label)
+        if key not in self._seen:
+            state = dict(self._states())[label]
+            self._seen[key] = seen_in(self._shot(self._taken[frame.path]), state)
+        return self._seen[key]
+
+    def _shot(self, frame: Frame) -> Shot:
+        """A photo with what is known of it."""
+        scenery = self._scenery
+        image = frame_image(frame)
+        view = next(v for v in scenery.surfaces.views if v.frame is frame)
+        gain = gain_of(scaled_image(frame, view.camera), view.rgb, view.depth.isfinite())
+        surface, limit = depth_in(scenery.field, scenery.surfaces, frame, self._box(frame), self._standing)
+        return Shot(image, frame.camera, frame.world_from_cam, surface, limit, look_of(image, gain))
+
+    def _box(self, frame: Frame) -> tuple[int, int, int, int]:
+        """Left, top, right, bottom of the part of a photo in which objects stand, before or after."""
+        items = (*self._plan.world.before.items, *self._plan.world.after.items)
+        corners = torch.cat([torch.cartesian_prod(*item.box().T) for item in items])
+        pixels, z = frame.camera.project(transform(invert(frame.world_from_cam), corners))
+        if not bool((z > 0).all()):
+            return 0, 0, 0, 0
+        size = pixels.new_tensor([frame.camera.width, frame.camera.height])
+        lo, hi = (torch.minimum(x.clamp_min(0), size) for x in (pixels.amin(0) - 8, pixels.amax(0) + 8))
+        return int(lo[0]), int(lo[1]), int(hi[0]), int(hi[1])

@@ -1,0 +1,129 @@
+"""Objects put into photos of a scene whose field is known: they stand on its floor, are hidden by it, and are told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from refield.cli import main
+from refield.field.render import render_camera
+from refield.rehearse.compose import compose, divided, scenery_of
+from refield.rehearse.plan import HAPPENINGS
+from refield.scene.camera import Camera
+from refield.scene.capture import Capture, Frame
+from refield.scene.change_files import load_change
+from refield.scene.errors import InputError
+from refield.scene.images import frame_image, read_image, read_mask, write_image
+from refield.scene.transforms_json import load_transforms
+from refield.synthetic.cameras import hemisphere
+from refield.synthetic.oracles import AnalyticField
+from refield.synthetic.placing import box_item, floor
+from refield.synthetic.state import State
+
+CAMERA = Camera(72, 64, 70.0, 70.0, 36.0, 32.0, k1=0.05)
+COUNT = 24
+
+
+@pytest.fixture(scope="module")
+def scenery(tmp_path_factory):
+    """A floor with one box on it, photographed by its own field."""
+    rng, folder = np.random.default_rng(0), tmp_path_factory.mktemp("photos")
+    state = State((floor(rng), box_item(rng, "box", (0.12, 0.12, 0.2), 0.6, (0.0, 0.0, 20.0))), np.zeros((1, 2, 3)))
+    field = AnalyticField(state, resolution=64)
+    poses = hemisphere(COUNT * 2, (0.0, 0.0, 0.1))[COUNT // 2 : COUNT // 2 + COUNT]
+    frames = []
+    for i, pose in enumerate(poses):
+        path = folder / f"{i:03d}.png"
+        write_image(path, render_camera(field, CAMERA, pose).rgb)
+        frames.append(Frame(path, CAMERA, path.name, pose))
+    return scenery_of(field, Capture(tuple(frames)))
+
+
+def test_the_photos_are_divided(scenery):
+    photos = divided(scenery.capture)
+    names = [f.name for group in (photos.before, photos.after, photos.evaluation) for f in group]
+    assert sorted(names) == sorted(f.name for f in scenery.capture.frames)
+    assert len(photos.after) == len(photos.evaluation) == 4
+    with pytest.raises(InputError, match="needs 20"):
+        divided(Capture(scenery.capture.frames[:10]))
+
+
+def test_the_floor_is_found(scenery):
+    plane = scenery.surfaces.planes[0]
+    assert plane.normal[2] > 0.995 and abs(plane.offset) < 0.02
+
+
+@pytest.mark.parametrize("seed", range(len(HAPPENINGS)))
+def test_what_happens_is_what_is_told(scenery, tmp_path, seed):
+    plan = compose(scenery, tmp_path, seed)
+    before, after = load_transforms(tmp_path / "before"), load_transforms(tmp_path / "after")
+    truth = load_change(tmp_path / "truth", before)
+    assert len(before.frames) == COUNT - 8 and len(after.frames) == 4
+    assert before.frames[0].camera == CAMERA
+    kinds, happening = [o.kind for o in truth.objects], HAPPENINGS[seed]
+    expected = {"turned": ["moved"], "tipped": ["moved"], "nothing": []}.get(happening, [happening])
+    assert kinds == expected if happening != "several" else len(kinds) >= 2
+    assert plan.facts["changes"] == kinds and not plan.facts["floating"]
+    for item in (*plan.world.before.items, *plan.world.after.items):
+        vertices = torch.from_numpy(item.solid.mesh()[0]).double() @ item.world_from_item[:3, :3].T
+        lowest = float((vertices[:, 2] + item.world_from_item[2, 3]).min())
+        assert abs(lowest) < 0.04, "it stands on the floor"
+
+
+def test_the_old_photos_change_only_by_the_objects(scenery, tmp_path):
+    compose(scenery, tmp_path, 0)
+    before = load_transforms(tmp_path / "before")
+    truth = load_change(tmp_path / "truth", before)
+    shown = [m.float().mean() for m in truth.objects[0].masks]
+    assert sum(m > 0.005 for m in shown) >= len(shown) / 3
+    for frame, was, mask in zip(before.train, _train(scenery, before), truth.objects[0].masks):
+        differs = (frame_image(frame) != was).any(-1)
+        assert differs.float().mean() < 0.7 and (mask & differs).sum() >= 0.8 * mask.sum()
+
+
+def _train(scenery, before):
+    photos = {f"images/{i:04d}.png": f for i, f in enumerate(scenery.photos.before)}
+    return [frame_image(photos[f.name]) for f in before.train]
+
+
+def test_the_masks_and_depths_of_the_new_photos(scenery, tmp_path):
+    plan = compose(scenery, tmp_path, 0)
+    seen = 0
+    for frame in load_transforms(tmp_path / "eval").frames:
+        now = read_mask(tmp_path / "eval" / "masks_in" / frame.path.name)
+        depth = np.load(tmp_path / "eval" / "depth" / f"{frame.path.stem}.npz")["depth"]
+        away = float((plan.world.after.items[0].world_from_item[:3, 3] - frame.centre).norm())
+        reach = 2 * max(plan.world.after.items[0].solid.half)
+        assert (np.abs(depth[now.numpy()] - away) < reach).all()
+        seen += int(now.sum())
+    assert seen > 100
+
+
+def test_the_same_seed_makes_the_same_photos(scenery, tmp_path):
+    for name in ("a", "b"):
+        compose(scenery, tmp_path / name, 2)
+    a, b = (read_image(tmp_path / n / "before" / "images" / "0003.png") for n in ("a", "b"))
+    assert torch.equal(a, b)
+
+
+def test_without_a_plane_things_float_and_this_is_told(scenery, tmp_path):
+    surfaces = replace(scenery.surfaces, planes=())
+    plan = compose(replace(scenery, surfaces=surfaces), tmp_path, 1)
+    assert plan.facts["floating"] and load_change(tmp_path / "truth").objects[0].kind == "added"
+
+
+def test_where_no_photo_sees_anything_there_is_no_place(scenery, tmp_path):
+    views = tuple(replace(v, depth=torch.full_like(v.depth, 1e-3)) for v in scenery.surfaces.views)
+    with pytest.raises(InputError, match="no free place"):
+        compose(replace(scenery, surfaces=replace(scenery.surfaces, views=views)), tmp_path, 0)
+
+
+def test_a_capture_without_a_field_is_refused(tmp_path, capsys):
+    (tmp_path / "data").mkdir()
+    data, out = str(tmp_path / "data"), str(tmp_path / "o")
+    for command in (["rehearse", data], ["synth", "random", out, "--into", data]):
+        assert main(command) == 2
+        assert "train it first" in capsys.readouterr().err
+    assert main(["synth", "cube", out, "--into", data]) == 2
+    assert "random" in capsys.readouterr().err
