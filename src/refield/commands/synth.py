@@ -16,6 +16,7 @@ from refield.commands.clock import Clock
 from refield.scene.errors import InputError
 from refield.synthetic.random_write import write_random
 from refield.synthetic.write import SynthConfig, write_world
+from refield.workspace import refuse_inside
 
 RANDOM = "random"
 
@@ -81,6 +82,7 @@ def _refuse_the_others_options(options: Synth) -> None:
 
 
 def _refuse_unless_free(out: Path, *, overwrite: bool) -> None:
+    refuse_inside(out)
     if out.exists() and not out.is_dir():
         raise InputError(out, "is a file, not a folder", "choose another output folder")
     if out.exists() and any(out.iterdir()) and not overwrite:
