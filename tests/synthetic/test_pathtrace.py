@@ -113,3 +113,10 @@ def test_bad_requests_are_refused_before_any_work(tmp_path):
     with pytest.raises(InputError, match="cameras"):
         SynthConfig(cameras=9)
     assert not (tmp_path / "x").exists()
+
+
+def test_any_seed_is_one_of_the_renderer(tracer):
+    world = WORLDS["cube"](0)
+    pose = ring(world.target)[0]
+    first, same = (tracer(world.before).photo(square_camera(8), pose, 1, seed) for seed in (7, 7 + 2**32))
+    assert torch.equal(first, same)
