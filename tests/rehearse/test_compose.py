@@ -1,6 +1,7 @@
 """Objects put into photos of a scene whose field is known: they stand on its floor, are hidden by it, and are told."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from refield.cli import main
 from refield.field.render import render_camera
 from refield.rehearse.compose import compose, divided, scenery_of
 from refield.rehearse.plan import HAPPENINGS
+from refield.rehearse.surfaces import View, _planes
 from refield.scene.camera import Camera
-from refield.scene.capture import Capture, Frame
+from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change_files import load_change
 from refield.scene.errors import InputError
 from refield.scene.images import frame_image, read_image, read_mask, write_image
@@ -19,6 +21,7 @@ from refield.scene.transforms_json import load_transforms
 from refield.synthetic.cameras import hemisphere
 from refield.synthetic.oracles import AnalyticField
 from refield.synthetic.placing import box_item, floor
+from refield.synthetic.random_textures import PATTERNS
 from refield.synthetic.state import State
 
 CAMERA = Camera(72, 64, 70.0, 70.0, 36.0, 32.0, k1=0.05)
@@ -54,6 +57,17 @@ def test_the_floor_is_found(scenery):
     assert plane.normal[2] > 0.995 and abs(plane.offset) < 0.02
 
 
+def test_photos_of_nothing_but_a_floor_show_one_plane(scenery):
+    level = torch.eye(4, dtype=torch.float64)
+    level[:3, :3] = torch.diag(torch.tensor([1.0, -1.0, -1.0]))  # it looks straight down
+    level[2, 3] = 2.0
+    camera = replace(CAMERA, k1=0.0)
+    depth = (-2.0 / camera_rays(camera, level).directions[:, 2]).reshape(camera.height, camera.width).float()
+    view = View(Frame(Path("none.png"), camera, "none.png", level), camera, torch.zeros(*depth.shape, 3), depth)
+    (plane,) = _planes([view], scenery.up, 0.01)
+    assert plane.normal[2] == pytest.approx(1, abs=1e-4) and plane.offset == pytest.approx(0, abs=1e-3)
+
+
 @pytest.mark.parametrize("seed", range(len(HAPPENINGS)))
 def test_what_happens_is_what_is_told(scenery, tmp_path, seed):
     plan = compose(scenery, tmp_path, seed)
@@ -65,6 +79,8 @@ def test_what_happens_is_what_is_told(scenery, tmp_path, seed):
     expected = {"turned": ["moved"], "tipped": ["moved"], "nothing": []}.get(happening, [happening])
     assert kinds == expected if happening != "several" else len(kinds) >= 2
     assert plan.facts["changes"] == kinds and not plan.facts["floating"]
+    told = [o["change"] for o in plan.facts["objects"] if o["change"] != "none"]
+    assert sorted(told) == sorted(kinds) and all(o["texture"] in PATTERNS for o in plan.facts["objects"])
     for item in (*plan.world.before.items, *plan.world.after.items):
         vertices = torch.from_numpy(item.solid.mesh()[0]).double() @ item.world_from_item[:3, :3].T
         lowest = float((vertices[:, 2] + item.world_from_item[2, 3]).min())
