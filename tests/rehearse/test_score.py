@@ -58,3 +58,8 @@ def test_seeds(text, seeds):
 def test_no_seeds(text):
     with pytest.raises(InputError, match="--seeds"):
         seeds_of(text)
+
+
+def test_seeds_the_wrong_way_round_are_put_right():
+    with pytest.raises(InputError, match=r"ends before it begins; give 2\.\.5"):
+        seeds_of("5..2")
