@@ -232,7 +232,6 @@ def in_room(rng: np.random.Generator, place: Place, wide: float, high: float) ->
     names = [random_textures.wall(rng, 384)[1] for _ in range(int(rng.integers(1, 5)))]
     paints = [names[k % len(names)] for k in range(4)]
     white = np.full((8, 8, 3), 0.85, np.float32)
-    have = {item.name for item in place.items}
     floor = replace(place.items[0], solid=Box((wide, wide, t)))
     walls = [
         slab_item("room north", (-wide, wide, 0), (wide, wide + t, high), paints[0]),
@@ -241,4 +240,4 @@ def in_room(rng: np.random.Generator, place: Place, wide: float, high: float) ->
         slab_item("room west", (-wide - t, -wide, 0), (-wide, wide, high), paints[3]),
         slab_item("ceiling", (-wide, -wide, high), (wide, wide, high + t), white),
     ]
-    return replace(place, items=(floor, *place.items[1:], *(wall for wall in walls if wall.name not in have)))
+    return replace(place, items=(floor, *place.items[1:], *walls))
