@@ -14,9 +14,10 @@ from torch import Tensor
 from refield.rehearse.spots import Site, is_free, pose_at, upright
 from refield.scene.errors import InputError
 from refield.scene.pose import exp
-from refield.synthetic.random_objects import drawn_item, round_about_z
+from refield.synthetic.random_objects import drawn_item
 from refield.synthetic.random_textures import Pattern
 from refield.synthetic.shading import Light
+from refield.synthetic.shapes import Solid
 from refield.synthetic.state import Item, State, World
 from refield.synthetic.textures import to_linear
 
@@ -26,7 +27,8 @@ LARGEST, SMALLEST = 0.35, 0.10
 """of the picture's shorter side at that distance"""
 _TRIES = 60
 _SHRINK, _LEAST = 0.85, 0.9
-_LEAST_TURN, _MOST_TURN = 20.0, 180.0  # degrees
+_LEAST_TURN, _MOST_TURN = 25.0, 65.0  # degrees: a square looks the same again at 90
+_ROUND = 0.05  # of its reach from the upright: what turns by less of it looks as before
 _MEAN_ALBEDO = 0.3
 _WHITEST = 0.8
 
@@ -59,7 +61,7 @@ class _Stage:
         """A random object; one that is to be turned is not round."""
         while True:
             item, family, pattern = drawn_item(self.rng, name, size / 3**0.5 * self.rng.uniform(1.1, 1.5))
-            if doing != "turned" or not round_about_z(item.solid):
+            if doing != "turned" or not is_round(item.solid):
                 self.drawn_as[name] = (family, pattern)
                 return item
 
@@ -80,6 +82,15 @@ class _Stage:
                 self.taken.append((spots[k], radius))
                 return replace(item, world_from_item=pose_at(self.site, spots[k], turn, -lowest))
         return None
+
+
+def is_round(solid: Solid) -> bool:
+    """Whether turning it about its own upright hardly changes its shape: also a bottle's or a tube's."""
+    vertices = torch.from_numpy(solid.mesh()[0]).double()
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    turned = torch.cat([vertices @ _twist(up, d).T for d in np.linspace(_LEAST_TURN, _MOST_TURN, 3)])
+    reach = float(vertices[:, :2].norm(dim=-1).max())
+    return float(solid.distance(turned).max()) < _ROUND * reach
 
 
 def plan_of(sites: Sequence[Site], seed: int) -> Plan:
