@@ -85,18 +85,15 @@ def inserted(shot: Shot, state: State, light: Light, shadow: Shadow, seed: int =
     return Inserted(image, seen.item, distance)
 
 
-def seen_in(shot: Shot, state: State) -> Inserted:
-    """What `inserted` would show of which item, without the picture itself."""
-    item, depth = torch.full(shot.surface.shape, -1), shot.surface.clone()
+def seen_in(shot: Shot, state: State) -> Tensor:
+    """Which item each pixel's centre would show, as `Inserted.item`, without the picture itself."""
+    item = torch.full(shot.surface.shape, -1)
     window = _window(shot, state, 0.0)
     if window is not None:
         rays = camera_rays(shot.camera, shot.world_from_cam, _centres(window))
-        hits = first_hits(state, rays)
-        shape = depth[window].shape
-        distance = hits.depth.reshape(shape)
-        item[window] = torch.where(distance <= shot.limit[window], hits.item.reshape(shape), -1)
-        depth[window] = torch.where(item[window] >= 0, distance, depth[window])
-    return Inserted(torch.zeros(0), item, depth)
+        hits, limit = first_hits(state, rays), shot.limit[window]
+        item[window] = torch.where(hits.depth.reshape(limit.shape) <= limit, hits.item.reshape(limit.shape), -1)
+    return item
 
 
 def _window(shot: Shot, state: State, margin: float) -> Window | None:

@@ -33,7 +33,7 @@ CAMERAS = 180
 Progress = Callable[[int, int], None]
 """Called with the pictures done and their number."""
 Seen = Callable[[State, Frame], Tensor]
-"""Which item of a state each pixel's centre of a photo shows, (H, W) int64, -1 for none."""
+"""Which item of a state each pixel's centre of a photo shows, (H, W) integers, -1 for none."""
 
 
 @dataclass(frozen=True)
