@@ -53,7 +53,8 @@ RANDOM = 0
 RANDOM_FLOORS = Floors(("moved", "moved"), psnr_in=21.3, psnr_out=25.9, untouched=28.4)
 # Real photographs with a box composited in; found half a turn off with both seeds (177° and 180°), so no angle is asked
 # for. The two fits differ by 3.3 dB in and 4.3 out: of the lower one the margins of the worlds are taken. What is shown
-# around the box's old place costs untouched pixels 1.5 dB with one seed and 0.2 with the other: a fault, held where it is.
+# around the box's old place costs untouched pixels 1.5 dB with one seed and 0.2 with the other: a fault, and held where
+# it is.
 FOX = Floors(("moved",), psnr_in=17.6, psnr_out=12.9, untouched=23.1, lost=2.0, off=0.77)
 
 
