@@ -108,14 +108,42 @@ def test_a_fit_that_leads_nowhere_begins_anew(capture: Capture, monkeypatch: pyt
     assert asked == [*range(1, 21)]  # too late to begin anew: it goes on with what it has
 
 
-def test_what_leads_nowhere(capture: Capture) -> None:
-    fit = object.__new__(_Fit)
-    sound = ((0.0135, 0.006, False), (0.0058, 0.0056, False), (0.004, 0.004, False))
-    for first, second, stuck in ((0.0135, 0.0115, True), (0.0118, 0.0099, True), *sound):
-        fit.steps_done, fit.loss = 250, first
-        assert not fit._stuck()
-        fit.steps_done, fit.loss = 500, second
-        assert fit._stuck() == stuck
+def attempts(capture: Capture, config: FitConfig) -> int:
+    """How often a fit begins."""
+    steps: list[int] = []
+    fit_field(capture, config, on_step=lambda step, field: steps.append(step))
+    return steps.count(1)
+
+
+def rephotographed(capture: Capture, folder: Path, change: Callable[[torch.Tensor, int], torch.Tensor]) -> Capture:
+    """The same cameras with other pictures, each made of the old one, (H, W, 3) in [0, 1], and its number."""
+    frames = []
+    for i, frame in enumerate(capture.frames):
+        rgb = change(frame_image(frame).float() / 255, i).clamp(0, 1)
+        path = folder / frame.path.name
+        Image.fromarray((rgb * 255).round().numpy().astype(np.uint8)).save(path)
+        frames.append(replace(frame, path=path))
+    return replace(capture, frames=tuple(frames))
+
+
+def test_photos_learnt_by_heart_are_begun_anew(capture: Capture, tmp_path: Path) -> None:
+    """Pictures that have nothing to do with each other: what one teaches is no use to another."""
+
+    def unrelated(photo: torch.Tensor, i: int) -> torch.Tensor:
+        blocks = torch.rand(1, 3, 4, 4, generator=torch.Generator().manual_seed(i))
+        return torch.nn.functional.interpolate(blocks, photo.shape[:2], mode="bilinear")[0].permute(1, 2, 0)
+
+    few = replace(capture, frames=capture.frames[:20])
+    assert attempts(rephotographed(few, tmp_path, unrelated), replace(TINY, steps=510, check_every=1000)) == 5
+
+
+def test_bad_photos_of_a_scene_are_fitted_once(capture: Capture, tmp_path: Path) -> None:
+    """Grain that no field can explain: the error stays large, and hardly falls once the scene is learnt."""
+
+    def grainy(photo: torch.Tensor, i: int) -> torch.Tensor:
+        return photo + 0.2 * torch.randn(photo.shape, generator=torch.Generator().manual_seed(i))
+
+    assert attempts(rephotographed(capture, tmp_path, grainy), replace(TINY, steps=510, check_every=1000)) == 1
 
 
 def test_same_seed_same_field(capture: Capture) -> None:

@@ -7,9 +7,12 @@ import torch
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_many
 from refield.field.volrend import Samples, composite, interleaved
-from refield.scene.change import ObjectChange, SceneChange
+from refield.field.warp import crosses
+from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.update.composite import UpdatedField
+from refield.update.light import Relighting
 from refield.update.region import carved, move_out
+from tests.fields import small_field
 from tests.update.worlds import Ball, BallWorld, at, change_of, grid_of, moved, views
 
 
@@ -166,3 +169,45 @@ def test_leaving_out_what_is_hidden_leaves_the_picture() -> None:
         assert len(few) < 0.8 * len(every)
         seen = [composite(*field(*s.positions(rays)), s).rgb for s in (few, every)]
         assert float((seen[0] - seen[1]).abs().max()) < 5e-3
+
+
+def around(grid: OccupancyGrid, factor: float) -> torch.Tensor:
+    """A world box (2, 3), so many times as large as a grid's."""
+    middle, half = grid.aabb.mean(0), (grid.aabb[1] - grid.aabb[0]) / 2
+    return torch.stack([middle - factor * half, middle + factor * half])
+
+
+def test_rays_that_meet_nothing_that_changed_show_the_old_field_bit_for_bit() -> None:
+    """Whatever was learnt: a helper that is wrong everywhere, light that is wrong where there is any."""
+    before, wrong = BallWorld((OLD, BESIDE)), small_field()
+    change = change_of(moved(OLD, NEW_POSE))
+    gain = torch.zeros(9, 9, 9, 3)
+    gain[3:6, 3:6, 3:6] = -2.0
+    light = Relighting(torch.tensor([[-1.2, -1.2, -0.2], [-0.4, -0.4, 0.6]]), gain)
+    updated = UpdatedField(before, change, helper=wrong, light=light)
+    rays = views(64)
+    was, now = render_many(before, rays), render_many(updated, rays)
+    (was_there,), (is_there,) = [o.grid for o in change.objects], [o.grid_now for o in change.objects]
+    assert is_there is not None
+    lit = torch.tensor([[-1.0, -1.0, 0.0], [-0.6, -0.6, 0.4]])
+    cell = 2 * float(before.sampler.width(torch.tensor(1.0)))
+    lit = torch.stack([lit[0] - cell, lit[1] + cell])
+    far = ~crosses(rays, [around(was_there, 2.5), around(is_there, 2.5), lit])
+    assert 0.1 < float(far.float().mean()) < 0.9
+    for name in ("rgb", "depth", "opacity"):
+        assert torch.equal(getattr(was, name)[far], getattr(now, name)[far])
+    assert (was.rgb - now.rgb)[~far].abs().max() > 0.3  # and what is wrong shows where it is asked
+    _, same = updated.unchanged(rays)
+    assert torch.equal(was.rgb[same], now.rgb[same]) and same[far].all()
+    dark = (was.rgb - now.rgb).abs().amax(-1) > 1e-3
+    assert not (dark & same).any()
+
+
+def test_a_second_visit_leaves_the_first_ones_pixels_as_they_are() -> None:
+    first = UpdatedField(BallWorld((OLD, BESIDE)), change_of(moved(OLD, NEW_POSE)))
+    second = UpdatedField(first, change_of(ObjectChange("removed", grid_of(BESIDE))))
+    rays = views(64)
+    _, same = second.unchanged(rays)
+    was, now = render_many(first, rays).rgb, render_many(second, rays).rgb
+    assert torch.equal(was[same], now[same]) and not torch.equal(was, now)
+    assert (was != render_many(first.pretrained, rays).rgb)[same].any()  # some of them show what the first visit did

@@ -17,7 +17,7 @@ from refield.scene.capture import camera_rays
 from refield.scene.change import ObjectChange
 from refield.scene.planes import Plane
 from refield.update.composite import NOWHERE, UpdatedField
-from refield.update.fit_textured import textured_planes
+from refield.update.fit_textured import _apart, textured_planes
 from refield.update.ground import footholds
 from refield.update.region import Region, move_out
 from refield.update.supervision import Lessons
@@ -159,3 +159,9 @@ def test_places_far_apart_have_textures_of_their_own() -> None:
     ground = footholds([CHANGE.objects[0].grid], [LEVEL])
     planes = textured_planes(ground, around, cut, dark, NOWHERE, photos(AFTER, [0.4]), PIXEL)
     assert len(planes) == 2 and all(seen(p, AFTER, 3.0)[0] > 33 for p in planes)
+
+
+def test_places_that_touch_are_one_however_many_there_are() -> None:
+    at_x = [grid_of(Ball(at(x, 0.0, 0.25), 0.25)) for x in (0.0, 3.0, 0.4, 6.0, 3.4)]
+    parts = [{round(float(g.aabb[:, 0].mean()), 1) for g in part.grids} for part in _apart(Region(tuple(at_x)))]
+    assert sorted(parts, key=min) == [{0.0, 0.4}, {3.0, 3.4}, {6.0}]

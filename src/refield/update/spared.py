@@ -21,6 +21,7 @@ from refield.update.supervision import Lessons
 from refield.update.textured import TexturedPlane
 
 _PIXELS = 20_000  # of the new photos, that are asked; their errors' means are known to a few parts in a thousand
+_ROUNDED = 1 / 255**2 / 12  # squared error of a photo's own rounding to 8 bits; less is no difference
 
 
 @dataclass(frozen=True)
@@ -56,11 +57,11 @@ def spared(updated: UpdatedField, new: Lessons, changed: Tensor) -> tuple[Update
 
     was, now = errors(before), errors(updated)
     parts, left_out = _parts(updated), []
-    while parts and now[still].sum() > was[still].sum():
+    while parts and now[still].mean() > was[still].mean() + _ROUNDED:
         without = {name: part(updated) for name, part in parts.items()}
         found = {name: errors(field) for name, field in without.items()}
         name = min(found, key=lambda n: float(found[n][still].sum()))
-        if found[name][still].sum() >= now[still].sum() or found[name].sum() >= now.sum():
+        if found[name][still].mean() > now[still].mean() - _ROUNDED or found[name].mean() > now.mean():
             break
         left_out.append(
             LeftOut(name, 10 * float((now[still].sum() / found[name][still].sum().clamp_min(1e-12)).log10()))

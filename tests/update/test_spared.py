@@ -1,0 +1,71 @@
+"""Parts of an update that show unchanged pixels worse are left out, the rest is kept."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from refield.field.render import render_many
+from refield.scene.change import ObjectChange
+from refield.update.composite import UpdatedField
+from refield.update.light import Relighting
+from refield.update.region import move_out
+from refield.update.spared import spared
+from refield.update.supervision import Lessons
+from tests.update.worlds import Ball, BallWorld, at, change_of, grid_of, views
+
+OLD = Ball(at(-0.5, 0.2, 0.25), 0.25)
+BESIDE = Ball(at(0.3, 0.6, 0.3), 0.3)
+BEFORE, AFTER = BallWorld((OLD, BESIDE)), BallWorld((BESIDE,))
+CHANGE = change_of(ObjectChange("removed", grid_of(OLD)))
+DARK = Relighting(torch.tensor([[-1.2, -1.2, -0.2], [1.2, 1.2, 0.8]]), torch.full((9, 9, 9, 3), -0.4))
+LIGHT, SURROUNDINGS = "the light on what stood still", "what is beside the objects' places"
+
+
+class Tinted(BallWorld):
+    """The world after, its floor in other colours."""
+
+    def __call__(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+        sigma, rgb = super().__call__(x, d)
+        return sigma, 1 - rgb
+
+
+def lessons(factor: float = 1.0) -> tuple[Lessons, Tensor]:
+    """Three photos of the world after, so much brighter, and which of their pixels show what left."""
+    rays = views(64)
+    was, now = render_many(BEFORE, rays).rgb, render_many(AFTER, rays).rgb
+    count = len(rays) // 3
+    photo, place = torch.arange(3).repeat_interleave(count), torch.arange(count).repeat(3)
+    seen = factor * render_many(UpdatedField(BEFORE, CHANGE, helper=AFTER), rays).rgb
+    return Lessons(rays, seen, photo, place), (was - now).abs().amax(-1) > 0.02
+
+
+def test_light_that_is_wrong_is_left_out_and_the_rest_kept() -> None:
+    updated = UpdatedField(BEFORE, CHANGE, helper=AFTER, light=DARK)
+    kept, left_out = spared(updated, *lessons())
+    assert left_out[0].part == LIGHT and left_out[0].gain > 3
+    assert kept.light is None and kept.helper is AFTER
+
+
+def test_light_that_is_right_stays() -> None:
+    updated = UpdatedField(BEFORE, CHANGE, helper=AFTER, light=DARK)
+    kept, left_out = spared(updated, *lessons(factor=float(torch.tensor(-0.4).exp())))
+    assert kept is updated and left_out == ()
+
+
+def test_a_helper_that_is_wrong_about_the_surroundings_keeps_to_what_left() -> None:
+    updated = UpdatedField(BEFORE, CHANGE, helper=Tinted((BESIDE,)), region=move_out(CHANGE, 2.0))
+    new, changed = lessons()
+    kept, left_out = spared(updated, new, changed)
+    assert [o.part for o in left_out] == [SURROUNDINGS]
+    assert kept.helper is updated.helper
+    beside = torch.tensor([[-0.5, -0.2, 0.25], [-0.5, 0.2, 0.25]])  # inside the wide region only, inside both
+    assert updated.region.contains(beside).all() and kept.region.contains(beside).tolist() == [False, True]
+
+
+def test_what_no_pixel_contradicts_stays() -> None:
+    updated = UpdatedField(BEFORE, CHANGE, helper=AFTER)
+    kept, left_out = spared(updated, *lessons())
+    assert kept is updated and left_out == ()
+    new, changed = lessons()
+    assert spared(updated, new, torch.ones_like(changed)) == (updated, ())
