@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from refield.cli import main
+from refield.commands import rehearse
+from refield.field.fit import FitConfig
 from refield.field.render import render_camera
 from refield.rehearse.compose import compose, divided, scenery_of
 from refield.rehearse.plan import HAPPENINGS
@@ -16,6 +18,7 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change_files import load_change
 from refield.scene.errors import InputError
+from refield.scene.files import read_json
 from refield.scene.images import frame_image, read_image, read_mask, write_image
 from refield.scene.transforms_json import load_transforms
 from refield.synthetic.cameras import hemisphere
@@ -143,3 +146,15 @@ def test_a_capture_without_a_field_is_refused(tmp_path, capsys):
         assert "train it first" in capsys.readouterr().err
     assert main(["synth", "cube", out, "--into", data]) == 2
     assert "random" in capsys.readouterr().err
+
+
+def test_a_rehearsal_from_photos_to_numbers(scenery, tmp_path, capsys, monkeypatch):
+    """All of it, with a training so short that nothing is found."""
+    monkeypatch.setattr(rehearse, "prepared", lambda *_: (scenery, 1.0))
+    out = tmp_path / "out"
+    rehearse.run(rehearse.Rehearse(tmp_path / "work", "1", out, fit=FitConfig(steps=40)))
+    (one,) = read_json(out / rehearse.REPORT)["rehearsals"]
+    assert one["facts"]["happening"] == "added" and [o["kind"] for o in one["change"]["objects"]] == ["added"]
+    assert one["held_out_psnr"] > 10 and one["evaluation"]["pooled"]["psnr_in"] > 5 and one["refused"] == ""
+    assert "1 │ added " in capsys.readouterr().out
+    assert (out / "001/work/visits/001/report.html").is_file() and (out / "001/data/truth/change.json").is_file()

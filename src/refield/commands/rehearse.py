@@ -220,7 +220,8 @@ def table(done: Sequence[Rehearsed], size: float) -> Table:
 
 
 def _happened(r: Rehearsed) -> str:
-    return f"{r.facts['happening']} ({', '.join(r.facts['changes'])})" if r.facts["changes"] else "nothing"
+    happening, changes = r.facts["happening"], r.facts["changes"]
+    return happening if changes in ([], [happening]) else f"{happening} ({', '.join(changes)})"
 
 
 def _found(r: Rehearsed) -> str:
