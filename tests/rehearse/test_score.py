@@ -44,6 +44,11 @@ def test_kinds_too_many_and_too_few():
     assert [o.found for o in score.objects] == ["removed"] and score.extra == () and not score.all_right
 
 
+def test_a_neighbour_does_not_take_what_is_anothers():
+    score = score_change(of(change("removed", 0.1)), of(change("removed", 0.0), change("removed", 0.1)))
+    assert [o.found for o in score.objects] == [None, "removed"] and score.extra == ()
+
+
 def test_nothing_found_where_nothing_is_is_right():
     assert score_change(of(), of()).all_right
     assert not score_change(of(change("added")), of()).all_right
