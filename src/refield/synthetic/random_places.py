@@ -81,15 +81,15 @@ def draw_place(rng: np.random.Generator, *, outdoors: bool) -> Place:
     family = str(rng.choice(list(kinds), p=weights / weights.sum()))
     reach = float(rng.uniform(0.5, 1.2))
     kind, paint = random_textures.ground(rng, 1024 if outdoors else 768, outdoors=outdoors)
-    make = {
+    on_level: dict[str, _Furnish] = {
         "floor": _floor, "corner": _corner, "desk": _desk, "cluttered desk": _cluttered, "shelf": _shelf,
-        "steps": _steps, "slope": _rolling, "bowl": _rolling, "hills": _rolling,
-    }[family]  # fmt: skip
-    if make is _rolling:
-        place = _rolling(rng, reach, family, paint)
-    else:
-        place = make(rng, reach)  # type: ignore[operator]
+        "steps": _steps,
+    }  # fmt: skip
+    if family in on_level:
+        place = on_level[family](rng, reach)
         place = replace(place, items=(_level_ground(paint, _GROUND * reach, outdoors), *place.items))
+    else:
+        place = _rolling(rng, reach, family, paint)
     return replace(place, family=family, ground=kind)
 
 
