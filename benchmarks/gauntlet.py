@@ -37,7 +37,7 @@ def main() -> int:
         one_scene(Trial.from_json(arguments.scene), arguments.core, options)
         return 0
     synth, data = tuple(shlex.split(arguments.synth)), arguments.data if arguments.real else None
-    trials, skipped = chosen(_seeds(arguments.seeds), arguments.worlds, data, synth)
+    trials, skipped = chosen(arguments.seeds, arguments.worlds, data, synth)
     trials = [replace(t, train=tuple(shlex.split(arguments.train))) for t in trials]
     ledger = Ledger(arguments.ledger, "rehearsals" if arguments.real else "worlds")
     try:
@@ -54,7 +54,9 @@ def main() -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="", help="A..B, both included, or one: random worlds; with --real, changes")
+    parser.add_argument(
+        "--seeds", type=_seeds, default="", help="A..B, both included, or one: random worlds; with --real, changes"
+    )
     parser.add_argument("--worlds", nargs="*", default=[], help="worlds of `refield synth` by name")
     parser.add_argument("--real", action="store_true", help="real photographs")
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="where these are")
@@ -73,7 +75,10 @@ def _parser() -> argparse.ArgumentParser:
 
 def _seeds(text: str) -> list[int]:
     first, _, last = text.partition("..")
-    return list(range(int(first), int(last or first) + 1)) if first else []
+    try:
+        return list(range(int(first), int(last or first) + 1)) if first else []
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number and no A..B") from None
 
 
 if __name__ == "__main__":

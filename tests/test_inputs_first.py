@@ -57,6 +57,11 @@ ROWS = [
     (["evaluate", "work", "small"], "small/masks_in/000.png", "give both the same size"),
     (["evaluate", "work", "lacking"], "lacking/masks_out/000.png", "there is no mask"),
     (["evaluate", "work", "photos"], "photos/masks_in/000.png", "there is no mask"),
+    (["rehearse", "work", "--out", "work/mine"], "work/mine", "lies in the workspace"),
+    (["rehearse", "work", "--out", "notes"], "notes", "is not an empty folder"),
+    (["rehearse", "work", "--out", "a/b/out"], "the capture", "a rehearsal needs 20 or more"),
+    (["synth", "random", "a/b/out", "--into", "work"], "the capture", "a rehearsal needs 20 or more"),
+    (["synth", "random", "out", "--into", "work", "--cameras", "40"], "--cameras", "give --photos"),
 ]
 
 

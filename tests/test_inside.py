@@ -41,6 +41,10 @@ ROWS = [
     [*TRAIN, "work/visits/001"],
     [*TRAIN, "work/capture", "--overwrite"],
     ["train", "photos", "work/visits/001"],
+    ["synth", "cube", "work/visits/001"],
+    ["synth", "random", "linked", "--into", "work", "--overwrite"],
+    ["rehearse", "work", "--out", "work/visits/001"],
+    ["rehearse", "data", "--out", "linked/images"],
 ]
 
 

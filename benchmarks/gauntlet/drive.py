@@ -17,7 +17,7 @@ from record import Row
 
 from gauntlet.chain import COMMANDS, commands_of, failure
 from gauntlet.ledger import Ledger
-from gauntlet.row import RESULT, forget, keep, run_trial
+from gauntlet.row import RESULT, SCORES, STRIP, forget, keep, run_trial
 from gauntlet.sheet import sheet
 from gauntlet.summary import groups_table, quantiles_table, rows_table, shares_table
 from gauntlet.trials import Trial
@@ -75,7 +75,8 @@ def _in_process(trial: Trial, core: int | None, options: Options) -> None:
     folder = options.folder(trial)
     folder.mkdir(parents=True, exist_ok=True)
     forget(folder)  # of a scene that was interrupted
-    (folder / COMMANDS).unlink(missing_ok=True)
+    for name in (COMMANDS, SCORES, STRIP):
+        (folder / name).unlink(missing_ok=True)
     command = [sys.executable, str(SCRIPT), "--scene", trial.to_json(), "--out", str(options.out)]
     command += ["--keep"] * options.keep + ([] if core is None else ["--core", str(core)])
     environment = os.environ | ({} if core is None else dict.fromkeys(_ONE_THREAD, "1"))

@@ -24,7 +24,7 @@ from refield.scene.images import frame_image, read_image
 from refield.scene.load import is_posed
 from refield.scene.transforms_json import load_transforms, stem
 
-RESULT, STRIP = "row.json", "strip.png"
+RESULT, STRIP, SCORES = "row.json", "strip.png", "scores.json"
 _ROUND, _PLAIN = ("ball", "can", "pole", "cone"), "plain"
 BRIGHTER = 3
 """the factor by which errors are shown"""
@@ -53,7 +53,7 @@ def run_commands(chain: Chain, data: Path, train: Sequence[str] = ()) -> None:
         render = ("render", work, "--cameras", evaluation / "transforms.json", "--out")
         chain.run("render", *render, chain.folder / "renders")
         chain.run("render before", *render, chain.folder / "renders_before", "--visit", "0")
-    chain.run("evaluate", "evaluate", work, evaluation, "--out", chain.folder / "scores.json")
+    chain.run("evaluate", "evaluate", work, evaluation, "--out", chain.folder / SCORES)
 
 
 def forget(folder: Path) -> None:
@@ -83,7 +83,7 @@ def scored(folder: Path, data: Path | None, ran: Sequence[Ran]) -> Row:
         row["not understood"] = bool(change.unexplained)
         row["new photos used"] = f"{len(change.frames)} of {len(change.photos)}"
         row |= _masks(change, data / "after")
-    scores = folder / "scores.json"
+    scores = folder / SCORES
     return row | (_scores(read_json(scores)) if scores.is_file() else {})
 
 

@@ -39,4 +39,4 @@ def sheet(rows: Sequence[Row], folders: dict[str, Path], path: Path) -> None:
 
 def _caption(row: Row) -> str:
     psnr = [f"{k[5:]} {row[k]:.1f}" for k in ("psnr_in", "psnr_out", "psnr_untouched") if row.get(k) is not None]
-    return " · ".join([row["name"], *([wrong] if (wrong := verdict(row)) else []), " ".join(psnr) + " dB"])
+    return " · ".join(part for part in (row["name"], verdict(row), f"{' '.join(psnr)} dB" if psnr else "") if part)

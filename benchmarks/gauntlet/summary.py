@@ -1,4 +1,4 @@
-"""Rows as tables: quantiles, shares with their intervals, groups, and the worst first."""
+"""Rows as tables: shares with their intervals, quantiles, groups, each scene; and which are the worst."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ def kinds(told: Sequence[str] | None) -> str:
     return ", ".join(f"{told.count(k)} {k}" for k in dict.fromkeys(told)) or "nothing"
 
 
-def lost(row: Row) -> float | None:
-    """dB that untouched pixels have won (lost, if negative)."""
+def won(row: Row) -> float | None:
+    """dB that untouched pixels have won (lost, if negative); None where that was not measured."""
     now, was = row.get("psnr_untouched"), row.get("psnr_untouched before")
     return None if now is None or was is None else now - was
 
@@ -92,7 +92,7 @@ _MEASURES: dict[str, Callable[[Row], Iterable[Any]]] = {
     "PSNR-in, dB": lambda r: [r.get("psnr_in")],
     "PSNR-out, dB": lambda r: [r.get("psnr_out")],
     "untouched, dB": lambda r: [r.get("psnr_untouched")],
-    "untouched, after less before, dB": lambda r: [lost(r)],
+    "untouched, after less before, dB": lambda r: [won(r)],
     "whole views, dB": lambda r: [r.get("psnr")],
     "held-out of the first field, dB": lambda r: [r.get("held-out")],
     "moved objects, off, % of the distance": lambda r: [o.get("off, % of distance") for o in r.get("objects", [])],
@@ -117,6 +117,7 @@ def quantiles_table(rows: Sequence[Row]) -> str:
 def shares_table(rows: Sequence[Row]) -> str:
     known = told(rows)
     changed, same = ([r for r in known if "true" in r and bool(r["true"]) == some] for some in (True, False))
+    measured = [r for r in rows if won(r) is not None]
     lines = [
         _share("a traceback", rows, lambda r: failed(r, "crashed", "died")),
         _share("past the time limit", rows, lambda r: failed(r, "stopped")),
@@ -126,7 +127,7 @@ def shares_table(rows: Sequence[Row]) -> str:
         _share("false objects where something changed", changed, lambda r: r["false"] > 0),
         _share("false objects where nothing changed", same, lambda r: r["false"] > 0),
         _share("not understood where nothing changed", same, lambda r: bool(r.get("not understood"))),
-        _share(f"untouched pixels lose more than {_LOST} dB", rows, lambda r: (lost(r) or 0) < -_LOST),
+        _share(f"untouched pixels lose more than {_LOST} dB", measured, lambda r: (won(r) or 0) < -_LOST),
     ]
     return markdown([line for line in lines if line is not None])
 

@@ -1,24 +1,30 @@
 """Objects put into photos of a scene whose field is known: they stand on its floor, are hidden by it, and are told."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from refield.cli import main
+from refield.commands import rehearse
+from refield.field.fit import FitConfig
 from refield.field.render import render_camera
 from refield.rehearse.compose import compose, divided, scenery_of
 from refield.rehearse.plan import HAPPENINGS
+from refield.rehearse.surfaces import View, _planes
 from refield.scene.camera import Camera
-from refield.scene.capture import Capture, Frame
+from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change_files import load_change
 from refield.scene.errors import InputError
+from refield.scene.files import read_json
 from refield.scene.images import frame_image, read_image, read_mask, write_image
 from refield.scene.transforms_json import load_transforms
 from refield.synthetic.cameras import hemisphere
 from refield.synthetic.oracles import AnalyticField
 from refield.synthetic.placing import box_item, floor
+from refield.synthetic.random_textures import PATTERNS
 from refield.synthetic.state import State
 
 CAMERA = Camera(72, 64, 70.0, 70.0, 36.0, 32.0, k1=0.05)
@@ -54,6 +60,17 @@ def test_the_floor_is_found(scenery):
     assert plane.normal[2] > 0.995 and abs(plane.offset) < 0.02
 
 
+def test_photos_of_nothing_but_a_floor_show_one_plane(scenery):
+    level = torch.eye(4, dtype=torch.float64)
+    level[:3, :3] = torch.diag(torch.tensor([1.0, -1.0, -1.0]))  # it looks straight down
+    level[2, 3] = 2.0
+    camera = replace(CAMERA, k1=0.0)
+    depth = (-2.0 / camera_rays(camera, level).directions[:, 2]).reshape(camera.height, camera.width).float()
+    view = View(Frame(Path("none.png"), camera, "none.png", level), camera, torch.zeros(*depth.shape, 3), depth)
+    (plane,) = _planes([view], scenery.up, 0.01)
+    assert plane.normal[2] == pytest.approx(1, abs=1e-4) and plane.offset == pytest.approx(0, abs=1e-3)
+
+
 @pytest.mark.parametrize("seed", range(len(HAPPENINGS)))
 def test_what_happens_is_what_is_told(scenery, tmp_path, seed):
     plan = compose(scenery, tmp_path, seed)
@@ -65,6 +82,8 @@ def test_what_happens_is_what_is_told(scenery, tmp_path, seed):
     expected = {"turned": ["moved"], "tipped": ["moved"], "nothing": []}.get(happening, [happening])
     assert kinds == expected if happening != "several" else len(kinds) >= 2
     assert plan.facts["changes"] == kinds and not plan.facts["floating"]
+    told = [o["change"] for o in plan.facts["objects"] if o["change"] != "none"]
+    assert sorted(told) == sorted(kinds) and all(o["texture"] in PATTERNS for o in plan.facts["objects"])
     for item in (*plan.world.before.items, *plan.world.after.items):
         vertices = torch.from_numpy(item.solid.mesh()[0]).double() @ item.world_from_item[:3, :3].T
         lowest = float((vertices[:, 2] + item.world_from_item[2, 3]).min())
@@ -127,3 +146,15 @@ def test_a_capture_without_a_field_is_refused(tmp_path, capsys):
         assert "train it first" in capsys.readouterr().err
     assert main(["synth", "cube", out, "--into", data]) == 2
     assert "random" in capsys.readouterr().err
+
+
+def test_a_rehearsal_from_photos_to_numbers(scenery, tmp_path, capsys, monkeypatch):
+    """All of it, with a training so short that nothing is found."""
+    monkeypatch.setattr(rehearse, "prepared", lambda *_: (scenery, 1.0))
+    out = tmp_path / "out"
+    rehearse.run(rehearse.Rehearse(tmp_path / "work", "1", out, fit=FitConfig(steps=40)))
+    (one,) = read_json(out / rehearse.REPORT)["rehearsals"]
+    assert one["facts"]["happening"] == "added" and [o["kind"] for o in one["change"]["objects"]] == ["added"]
+    assert one["held_out_psnr"] > 10 and one["evaluation"]["pooled"]["psnr_in"] > 5 and one["refused"] == ""
+    assert "1 │ added " in capsys.readouterr().out
+    assert (out / "001/work/visits/001/report.html").is_file() and (out / "001/data/truth/change.json").is_file()

@@ -44,6 +44,11 @@ def test_kinds_too_many_and_too_few():
     assert [o.found for o in score.objects] == ["removed"] and score.extra == () and not score.all_right
 
 
+def test_a_neighbour_does_not_take_what_is_anothers():
+    score = score_change(of(change("removed", 0.1)), of(change("removed", 0.0), change("removed", 0.1)))
+    assert [o.found for o in score.objects] == [None, "removed"] and score.extra == ()
+
+
 def test_nothing_found_where_nothing_is_is_right():
     assert score_change(of(), of()).all_right
     assert not score_change(of(change("added")), of()).all_right
@@ -58,3 +63,8 @@ def test_seeds(text, seeds):
 def test_no_seeds(text):
     with pytest.raises(InputError, match="--seeds"):
         seeds_of(text)
+
+
+def test_seeds_the_wrong_way_round_are_put_right():
+    with pytest.raises(InputError, match=r"ends before it begins; give 2\.\.5"):
+        seeds_of("5..2")

@@ -57,8 +57,8 @@ def test_what_is_nearer_hides_it(box):
     assert (done.item == -1).all() and torch.equal(done.image, near.image)
     half = near.limit.clone()
     half[:, 48:] = 50.0
-    seen = seen_in(Shot(near.image, CAMERA, POSE, half, half, near.look), state)
-    assert torch.equal(seen.item == 0, silhouette(state, "box", CAMERA, POSE) & (half > 1))
+    item = seen_in(Shot(near.image, CAMERA, POSE, half, half, near.look), state)
+    assert torch.equal(item == 0, silhouette(state, "box", CAMERA, POSE) & (half > 1))
 
 
 def test_an_outline_is_smooth_and_as_blurred_as_the_photo(box):

@@ -12,7 +12,7 @@ from refield.scene.change_files import load_change
 from refield.scene.errors import InputError
 from refield.scene.images import read_image, read_mask
 from refield.scene.transforms_json import load_transforms
-from refield.synthetic import pathtrace
+from refield.synthetic import pathtrace, random_write
 from refield.synthetic.cameras import ring, square_camera
 from refield.synthetic.oracles import AnalyticField
 from refield.synthetic.visibility import view_hits
@@ -39,6 +39,15 @@ def test_a_missing_renderer_is_one_clear_line(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mitsuba", None)
     with pytest.raises(InputError, match=r"pip install 'refield\[synth\]'"):
         pathtrace.mitsuba.__wrapped__()
+
+
+def test_a_missing_renderer_is_told_before_a_world_is_drawn(monkeypatch, tmp_path):
+    monkeypatch.setitem(__import__("sys").modules, "mitsuba", None)
+    monkeypatch.setattr(random_write, "mitsuba", pathtrace.mitsuba.__wrapped__)
+    monkeypatch.setattr(random_write, "random_world", None)
+    with pytest.raises(InputError, match=r"pip install 'refield\[synth\]'"):
+        random_write.write_random(tmp_path / "out", SynthConfig())
+    assert not (tmp_path / "out").exists()
 
 
 def evenly_lit(state):
@@ -113,3 +122,10 @@ def test_bad_requests_are_refused_before_any_work(tmp_path):
     with pytest.raises(InputError, match="cameras"):
         SynthConfig(cameras=9)
     assert not (tmp_path / "x").exists()
+
+
+def test_any_seed_is_one_of_the_renderer(tracer):
+    world = WORLDS["cube"](0)
+    pose = ring(world.target)[0]
+    first, same = (tracer(world.before).photo(square_camera(8), pose, 1, seed) for seed in (7, 7 + 2**32))
+    assert torch.equal(first, same)

@@ -22,13 +22,14 @@ from refield.commands.train import Sources, train
 from refield.commands.update import Update, Visit, update
 from refield.evaluate import Report
 from refield.field.fit import FitConfig
-from refield.rehearse.compose import Scenery, compose, scenery_of
+from refield.rehearse.compose import Scenery, compose, divided, scenery_of
+from refield.rehearse.plan import NoRoomError
 from refield.rehearse.score import ChangeScore, score_change
 from refield.scene.change_files import load_change
 from refield.scene.errors import InputError
 from refield.scene.files import read_json, write_json
 from refield.scene.world import world_of
-from refield.workspace import Workspace
+from refield.workspace import Workspace, refuse_inside
 
 REPORT = "rehearsals.json"
 _MOST = 100
@@ -81,19 +82,47 @@ class Rehearsed:
 
 def run(options: Rehearse) -> None:
     seeds, clock = seeds_of(options.seeds), Clock()
+    if options.out is not None:
+        _refuse_unless_free(options.work, options.out)
     scenery, size = prepared(options.work, clock, options.fit, len(seeds))
     done: list[Rehearsed] = []
-    with _folder(options.work, options.out) as folder:
-        for seed in seeds:
+    try:
+        with _folder(options.out) as folder:
+            _rehearse_all(scenery, size, folder, seeds, clock, options, done)
+    finally:  # what is done has taken long, and is told whatever comes
+        clock.stop()
+        if done:
+            results().print(table(done, size))
+
+
+def _rehearse_all(
+    scenery: Scenery,
+    size: float,
+    folder: Path,
+    seeds: Sequence[int],
+    clock: Clock,
+    options: Rehearse,
+    done: list[Rehearsed],
+) -> None:
+    """Append to ``done``; a rehearsal that there is no room for is left out.
+
+    Raises:
+        NoRoomError: there was none for any.
+    """
+    for k, seed in enumerate(seeds, 1):
+        try:
             with _whole(folder / f"{seed:03d}") as place:
                 done.append(rehearsed(scenery, place, seed, clock, options))
-            if options.out is not None:  # after each, so that what is done is kept whatever comes
-                write_json(options.out / REPORT, _record(done, size))
-            left = (len(seeds) - len(done)) * sum(r.seconds for r in done) / len(done)
-            if left:
-                clock.console.print(f"           {len(done)} of {len(seeds)} rehearsed, about {_time(left)} left")
-    clock.stop()
-    results().print(table(done, size))
+        except NoRoomError as error:
+            if k == len(seeds) and not done:
+                raise
+            clock.warn(f"rehearsal {seed} is left out: {error}")
+            continue
+        if options.out is not None:
+            write_json(options.out / REPORT, _record(done, size))
+        left = (len(seeds) - k) * sum(r.seconds for r in done) / len(done)
+        if left:
+            clock.console.print(f"           {k} of {len(seeds)} rehearsed, about {_time(left)} left")
 
 
 def prepared(work: Path, clock: Clock, fit: FitConfig, count: int) -> tuple[Scenery, float]:
@@ -104,6 +133,7 @@ def prepared(work: Path, clock: Clock, fit: FitConfig, count: int) -> tuple[Scen
     """
     workspace = opened(work)
     capture = workspace.capture()
+    divided(capture)
     seconds = sum(survey_capture(capture, fit).seconds.values())
     each = f"each about one training (some {_time(seconds)} on this machine) and one update"
     clock.console.print(f"{count} rehearsals, {each}; Ctrl-C leaves nothing half done", markup=False)
@@ -155,12 +185,14 @@ def seeds_of(text: str) -> list[int]:
     """``7``, or ``from..to``, both of them too.
 
     Raises:
-        InputError: it is neither.
+        InputError: it is neither, or names none or too many.
     """
     found = re.fullmatch(r"(\d{1,9})(?:\.\.(\d{1,9}))?", text.strip())
-    if found is None or int(found[2] or found[1]) < int(found[1]):
+    if found is None:
         raise InputError("--seeds", f"{text!r} is no number and no from..to", "give 3, or 0..2")
     seeds = list(range(int(found[1]), int(found[2] or found[1]) + 1))
+    if not seeds:
+        raise InputError("--seeds", f"{text!r} ends before it begins", f"give {found[2]}..{found[1]}")
     if len(seeds) > _MOST:
         raise InputError("--seeds", f"names {len(seeds)} rehearsals", f"give {_MOST} at most")
     return seeds
@@ -188,7 +220,8 @@ def table(done: Sequence[Rehearsed], size: float) -> Table:
 
 
 def _happened(r: Rehearsed) -> str:
-    return f"{r.facts['happening']} ({', '.join(r.facts['changes'])})" if r.facts["changes"] else "nothing"
+    happening, changes = r.facts["happening"], r.facts["changes"]
+    return happening if changes in ([], [happening]) else f"{happening} ({', '.join(changes)})"
 
 
 def _found(r: Rehearsed) -> str:
@@ -224,17 +257,22 @@ def _whole(folder: Path) -> Iterator[Path]:
         raise
 
 
-@contextlib.contextmanager
-def _folder(work: Path, out: Path | None) -> Iterator[Path]:
-    """``out``, which must be empty and lie outside of the workspace; without it a folder that vanishes."""
-    if out is None:
-        with tempfile.TemporaryDirectory(prefix="refield-") as scratch:
-            yield Path(scratch)
-        return
+def _refuse_unless_free(work: Path, out: Path) -> None:
+    """Raises InputError: ``out`` is not empty, or lies in the workspace or in what another one keeps."""
+    refuse_inside(out)
     if out.resolve().is_relative_to(work.resolve()):
         raise InputError(out, "lies in the workspace, which stays as it is", "choose a folder outside of it")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(out, "is not an empty folder", "choose another output folder")
+
+
+@contextlib.contextmanager
+def _folder(out: Path | None) -> Iterator[Path]:
+    """``out``; without it a folder that vanishes."""
+    if out is None:
+        with tempfile.TemporaryDirectory(prefix="refield-") as scratch:
+            yield Path(scratch)
+        return
     with writable(out):
         out.mkdir(parents=True, exist_ok=True)
     yield out

@@ -30,8 +30,8 @@ class Synth:
     out: Annotated[Path, arg(metavar="OUT"), Positional]
     """the folder for before/, after/, eval/ and truth/"""
     into: Path | None = None
-    """a workspace: the world is ``random``, and its objects are put into the photos of that (needs no Mitsuba); of the
-    options below only the seed counts"""
+    """a workspace: the objects of the world random are put into its photos, as `refield rehearse` does (needs no
+    Mitsuba); of the config options only --seed counts"""
     overwrite: bool = False
     """write into a folder that is not empty"""
     config: OmitArgPrefixes[SynthConfig] = field(default_factory=SynthConfig)
@@ -40,11 +40,11 @@ class Synth:
 def run(options: Synth) -> None:
     clock = Clock()
     _refuse_unless_free(options.out, overwrite=options.overwrite)
+    _refuse_the_others_options(options)
     if options.into is not None:
         _into(options, options.into, clock)
         return
     clock.stage(f"path-trace {options.world}")
-    _refuse_the_others_options(options)
     with writable(options.out), clock.counting("photos") as count:
         if options.world == RANDOM:
             write_random(options.out, options.config, on_progress=count)
@@ -59,14 +59,16 @@ def run(options: Synth) -> None:
 def _into(options: Synth, work: Path, clock: Clock) -> None:
     """Put objects into the photos of a workspace."""
     from refield.commands.rehearse import opened
-    from refield.rehearse.compose import compose, scenery_of
+    from refield.rehearse.compose import compose, divided, scenery_of
 
     if options.world != RANDOM:
         raise InputError("--into", f"does not go with the world {options.world!r}", "give the world 'random'")
     workspace = opened(work)
+    capture = workspace.capture()
+    divided(capture)
     clock.stage("find out how far off things are")
     with clock.counting("views") as count:
-        scenery = scenery_of(workspace.field(), workspace.capture(), count)
+        scenery = scenery_of(workspace.field(), capture, count)
     clock.stage("put objects into the photos")
     with writable(options.out), clock.counting("photos") as count:
         plan = compose(scenery, options.out, options.config.seed, count)

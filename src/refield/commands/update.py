@@ -85,7 +85,7 @@ def run(options: Update) -> None:
 
 
 def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | None = None) -> Visit:
-    """Estimate, update, judge, report: one visit, published whole or not at all.
+    """Estimate, update, report: one visit, published whole or not at all.
 
     Raises:
         InputError: no workspace, or unusable photos.

@@ -24,7 +24,7 @@ from refield.scene.images import frame_image, scaled_image, write_image
 from refield.scene.pose import invert, transform
 from refield.scene.transforms_json import save_transforms
 from refield.scene.world import world_of
-from refield.synthetic.insert import Inserted, Shot, inserted, seen_in
+from refield.synthetic.insert import Shot, inserted, seen_in
 from refield.synthetic.looks import gain_of, look_of
 from refield.synthetic.shading import CastShadow
 from refield.synthetic.state import State
@@ -92,7 +92,7 @@ def compose(scenery: Scenery, out: Path, seed: int, on_progress: Count | None = 
     """Write a rehearsal into the folder ``out``. Everything random is from ``seed``.
 
     Raises:
-        InputError: there is no free place that enough photos see.
+        NoRoomError: there is no free place that enough photos see.
     """
     photos, surfaces = scenery.photos, scenery.surfaces
     views = {id(view.frame): view for view in surfaces.views}
@@ -140,8 +140,8 @@ class _Studio:
             self._standing = Standing(site.up, site.offset, 2 * site.even)
             plane = (site.up, site.offset, 2 * site.even)
         self._shadow = {s: CastShadow(state, plan.light, plane) for s, state in self._states()}
-        self._taken: dict[Path, Frame] = {}
-        self._seen: dict[tuple[Path, str], Inserted] = {}
+        self._items: dict[tuple[Path, str], Tensor] = {}  # of every photo, in both states
+        self._depth: dict[Path, Tensor] = {}  # of those of the new state
 
     def _states(self) -> tuple[tuple[str, State], tuple[str, State]]:
         return ("before", self._plan.world.before), ("after", self._plan.world.after)
@@ -155,11 +155,14 @@ class _Studio:
         for i, frame in enumerate(frames):
             path = folder / "images" / f"{i:04d}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._taken[path] = frame
             shot = self._shot(frame)
             picture = inserted(shot, state, self._plan.light, self._shadow[name], seed=i)
             write_image(path, picture.image)
-            self._seen[path, name] = replace(picture, image=torch.zeros(0))  # many photos are large
+            for label, other in self._states():
+                item = picture.item if label == name else seen_in(shot, other)
+                self._items[path, label] = item.to(torch.int8)  # many photos are large
+            if name == "after":
+                self._depth[path] = picture.depth
             kept.append(replace(frame, path=path, name=f"images/{path.name}"))
             if tell is not None:
                 tell(i + 1)
@@ -175,19 +178,12 @@ class _Studio:
             now, then = masks_of(self._plan.world, frame, self.seen)
             write_image(folder / "masks_in" / frame.path.name, now)
             write_image(folder / "masks_out" / frame.path.name, then)
-            depth = self._picture(frame, "after").depth
-            np.savez_compressed(folder / "depth" / f"{frame.path.stem}.npz", depth=depth.numpy())
+            depth = self._depth[frame.path].numpy()
+            np.savez_compressed(folder / "depth" / f"{frame.path.stem}.npz", depth=depth)
 
     def seen(self, state: State, frame: Frame) -> Tensor:
-        """Which item of a state each pixel of a photo would show, (H, W) int64, -1 for none: the truth's `Seen`."""
-        return self._picture(frame, next(n for n, s in self._states() if s is state)).item
-
-    def _picture(self, frame: Frame, label: str) -> Inserted:
-        key = (frame.path, label)
-        if key not in self._seen:
-            state = dict(self._states())[label]
-            self._seen[key] = seen_in(self._shot(self._taken[frame.path]), state)
-        return self._seen[key]
+        """Which item of a state each pixel of a photo would show, (H, W) int8, -1 for none: the truth's `Seen`."""
+        return self._items[frame.path, next(n for n, s in self._states() if s is state)]
 
     def _shot(self, frame: Frame) -> Shot:
         """A photo with what is known of it."""

@@ -14,8 +14,10 @@ from torch import Tensor
 from refield.rehearse.spots import Site, is_free, pose_at, upright
 from refield.scene.errors import InputError
 from refield.scene.pose import exp
-from refield.synthetic.random_objects import drawn_item, round_about_z
+from refield.synthetic.random_objects import drawn_item
+from refield.synthetic.random_textures import Pattern
 from refield.synthetic.shading import Light
+from refield.synthetic.shapes import Solid
 from refield.synthetic.state import Item, State, World
 from refield.synthetic.textures import to_linear
 
@@ -25,9 +27,14 @@ LARGEST, SMALLEST = 0.35, 0.10
 """of the picture's shorter side at that distance"""
 _TRIES = 60
 _SHRINK, _LEAST = 0.85, 0.9
-_LEAST_TURN, _MOST_TURN = 20.0, 180.0  # degrees
+_LEAST_TURN, _MOST_TURN = 25.0, 65.0  # degrees: a square looks the same again at 90
+_ROUND = 0.05  # of its reach from the upright: what turns by less of it looks as before
 _MEAN_ALBEDO = 0.3
 _WHITEST = 0.8
+
+
+class NoRoomError(InputError):
+    """There is no place for what is to happen."""
 
 
 @dataclass(frozen=True)
@@ -47,14 +54,15 @@ class _Stage:
     site: Site
     rng: np.random.Generator
     taken: list[tuple[NDArray[np.float64], float]]
-    families: dict[str, str] = field(default_factory=dict)
+    drawn_as: dict[str, tuple[str, Pattern]] = field(default_factory=dict)
+    """family and texture, by name"""
 
     def drawn(self, name: str, size: float, doing: str) -> Item:
         """A random object; one that is to be turned is not round."""
         while True:
-            item, family, _ = drawn_item(self.rng, name, size / 3**0.5 * self.rng.uniform(1.1, 1.5))
-            if doing != "turned" or not round_about_z(item.solid):
-                self.families[name] = family
+            item, family, pattern = drawn_item(self.rng, name, size / 3**0.5 * self.rng.uniform(1.1, 1.5))
+            if doing != "turned" or not is_round(item.solid):
+                self.drawn_as[name] = (family, pattern)
                 return item
 
     def place(self, item: Item, near: Tensor | None = None, tip: Tensor | None = None) -> Item | None:
@@ -76,11 +84,20 @@ class _Stage:
         return None
 
 
+def is_round(solid: Solid) -> bool:
+    """Whether turning it about its own upright hardly changes its shape: also a bottle's or a tube's."""
+    vertices = torch.from_numpy(solid.mesh()[0]).double()
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    turned = torch.cat([vertices @ _twist(up, d).T for d in np.linspace(_LEAST_TURN, _MOST_TURN, 3)])
+    reach = float(vertices[:, :2].norm(dim=-1).max())
+    return float(solid.distance(turned).max()) < _ROUND * reach
+
+
 def plan_of(sites: Sequence[Site], seed: int) -> Plan:
     """A random rehearsal at the first of the sites that has room for it.
 
     Raises:
-        InputError: there is no place that enough photos see, or no free one.
+        NoRoomError: there is no place that enough photos see, or no free one.
     """
     rng = np.random.default_rng([seed, 11])
     happening, part = HAPPENINGS[seed % len(HAPPENINGS)], float(rng.uniform(SMALLEST, LARGEST))
@@ -94,7 +111,7 @@ def plan_of(sites: Sequence[Site], seed: int) -> Plan:
                 return Plan(world, site, light, _facts(seed, happening, stage, world, light))
             smaller *= _SHRINK
     what = "there is no free place in it that a third of the photos and three of the four new ones show"
-    raise InputError("the rehearsal", what, "photos that look at one place from many sides are needed")
+    raise NoRoomError("the rehearsal", what, "photos that look at one place from many sides are needed")
 
 
 def _enacted(stage: _Stage, happening: str, size: float) -> World | None:
@@ -181,10 +198,11 @@ def _facts(seed: int, happening: str, stage: _Stage, world: World, light: Light)
         "objects": [
             {
                 "name": name,
-                "family": stage.families[name],
+                "family": stage.drawn_as[name][0],
+                "texture": stage.drawn_as[name][1],
                 "size": 2 * max(item.solid.half),
                 "part_of_picture": 2 * max(item.solid.half) / site.width,
-                "change": kinds.get(name),
+                "change": kinds.get(name, "none"),
             }
             for name, item in items.items()
         ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from typing import Any
 
 import torch
@@ -47,24 +48,24 @@ class ChangeScore:
 
 
 def score_change(found: SceneChange, truth: SceneChange) -> ChangeScore:
-    """Each true change beside the found one nearest to it, if that lies within the object's own size of it."""
-    free = list(found.objects)
-    scores = []
-    for true in truth.objects:
-        match = _nearest(true, free)
-        if match is None:
-            scores.append(ObjectScore(true.kind, None))
-            continue
-        free.remove(match)
-        scores.append(_scored(true, match))
-    return ChangeScore(tuple(scores), tuple(o.kind for o in free))
+    """Each true change beside a found one that lies within the object's own size of it, the nearest pairs first."""
+    pairs = _pairs(found.objects, truth.objects)
+    scores = [
+        _scored(true, found.objects[pairs[t]]) if t in pairs else ObjectScore(true.kind, None)
+        for t, true in enumerate(truth.objects)
+    ]
+    return ChangeScore(tuple(scores), tuple(o.kind for f, o in enumerate(found.objects) if f not in pairs.values()))
 
 
-def _nearest(true: ObjectChange, among: Sequence[ObjectChange]) -> ObjectChange | None:
-    box = true.grid.tight_aabb()
-    near = [(_apart(true, o), i) for i, o in enumerate(among)]
-    distance, index = min(near, default=(float("inf"), -1))
-    return among[index] if distance < float((box[1] - box[0]).norm()) else None
+def _pairs(found: Sequence[ObjectChange], truth: Sequence[ObjectChange]) -> dict[int, int]:
+    """True object → found one."""
+    sizes = [float((box[1] - box[0]).norm()) for box in (true.grid.tight_aabb() for true in truth)]
+    near = sorted((_apart(a, b), t, f) for (t, a), (f, b) in product(enumerate(truth), enumerate(found)))
+    pairs: dict[int, int] = {}
+    for distance, t, f in near:
+        if distance < sizes[t] and t not in pairs and f not in pairs.values():
+            pairs[t] = f
+    return pairs
 
 
 def _apart(true: ObjectChange, other: ObjectChange) -> float:

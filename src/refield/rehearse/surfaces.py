@@ -149,6 +149,8 @@ def _planes(views: Sequence[View], up: Tensor, resolved: float) -> list[Plane]:
         rest = rest[rng.choice(len(rest), _MOST_LEVEL, replace=False)]
     planes, total = [], len(rest)
     for _ in range(3):
+        if len(rest) < _FEWEST:
+            break
         plane, on = _level_plane(rest, up.double().numpy(), resolved, rng)
         if on.sum() < max(_FEWEST, _SHARE * total):
             break

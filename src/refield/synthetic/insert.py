@@ -22,7 +22,7 @@ from refield.synthetic.looks import Look
 from refield.synthetic.shading import Light, shaded
 from refield.synthetic.state import State
 from refield.synthetic.textures import to_linear, to_srgb
-from refield.synthetic.visibility import first_hits
+from refield.synthetic.visibility import Hits, first_hits
 
 Window = tuple[slice, slice]
 """rows and columns of a picture"""
@@ -85,18 +85,15 @@ def inserted(shot: Shot, state: State, light: Light, shadow: Shadow, seed: int =
     return Inserted(image, seen.item, distance)
 
 
-def seen_in(shot: Shot, state: State) -> Inserted:
-    """What `inserted` would show of which item, without the picture itself."""
-    item, depth = torch.full(shot.surface.shape, -1), shot.surface.clone()
+def seen_in(shot: Shot, state: State) -> Tensor:
+    """Which item each pixel's centre would show, as `Inserted.item`, without the picture itself."""
+    item = torch.full(shot.surface.shape, -1)
     window = _window(shot, state, 0.0)
     if window is not None:
         rays = camera_rays(shot.camera, shot.world_from_cam, _centres(window))
-        hits = first_hits(state, rays)
-        shape = depth[window].shape
-        distance = hits.depth.reshape(shape)
-        item[window] = torch.where(distance <= shot.limit[window], hits.item.reshape(shape), -1)
-        depth[window] = torch.where(item[window] >= 0, distance, depth[window])
-    return Inserted(torch.zeros(0), item, depth)
+        hits, limit = first_hits(state, rays), shot.limit[window]
+        item[window] = torch.where(hits.depth.reshape(limit.shape) <= limit, hits.item.reshape(limit.shape), -1)
+    return item
 
 
 def _window(shot: Shot, state: State, margin: float) -> Window | None:
@@ -126,10 +123,10 @@ def _layer(
     """Of a window (h, w): item seen and its depth; linear colour (h, w, 3), times alpha (h, w)."""
     pixels = _centres(window)
     limit = shot.limit[window].reshape(-1)
-    item, depth, colour = _seen(shot, state, light, pixels, limit)
+    item, hits, colour = _seen(shot, state, light, pixels, limit)
     alpha = (item >= 0).float()
     shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
-    at = (_outline(item.reshape(shape)) | _outline(first_at(shot, state, pixels).reshape(shape))).reshape(-1)
+    at = (_outline(item.reshape(shape)) | _outline(hits.item.reshape(shape))).reshape(-1)
     if at.any():
         steps = (torch.arange(_FINE, dtype=torch.float64) + 0.5) / _FINE - 0.5
         offsets = torch.cartesian_prod(steps, steps)
@@ -137,16 +134,17 @@ def _layer(
         within, _, paint = _seen(shot, state, light, fine, limit[at].repeat_interleave(_FINE**2))
         colour[at] = paint.reshape(-1, _FINE**2, 3).mean(1)
         alpha[at] = (within >= 0).float().reshape(-1, _FINE**2).mean(1)
-    return item.reshape(shape), depth.reshape(shape), colour.reshape(*shape, 3).numpy(), alpha.reshape(shape).numpy()
+    return (
+        item.reshape(shape),
+        hits.depth.reshape(shape),
+        colour.reshape(*shape, 3).numpy(),
+        alpha.reshape(shape).numpy(),
+    )
 
 
-def first_at(shot: Shot, state: State, pixels: Tensor) -> Tensor:
-    """The first item along each pixel's ray (N,), whatever is in front of it; -1 for none."""
-    return first_hits(state, camera_rays(shot.camera, shot.world_from_cam, pixels)).item
-
-
-def _seen(shot: Shot, state: State, light: Light, pixels: Tensor, limit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of pixels (N, 2): the item seen (N,), its depth (N,) and linear colour (N, 3), black where none is."""
+def _seen(shot: Shot, state: State, light: Light, pixels: Tensor, limit: Tensor) -> tuple[Tensor, Hits, Tensor]:
+    """Of pixels (N, 2): the item seen (N,), the first one along the ray whatever is in front of it, and the linear
+    colour (N, 3) of what is seen, black where none is."""
     rays = camera_rays(shot.camera, shot.world_from_cam, pixels)
     hits = first_hits(state, rays)
     item = torch.where(hits.depth <= limit, hits.item, -1)
@@ -155,7 +153,7 @@ def _seen(shot: Shot, state: State, light: Light, pixels: Tensor, limit: Tensor)
         mine = item == i
         points = rays.origins[mine].double() + rays.directions[mine].double() * hits.depth[mine, None].double()
         colour[mine] = shaded(state, i, points, rays.directions[mine].double(), light).float()
-    return item, hits.depth, colour
+    return item, hits, colour
 
 
 def _outline(item: Tensor) -> Tensor:

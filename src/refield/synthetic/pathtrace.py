@@ -16,6 +16,7 @@ from refield.scene.errors import InputError
 from refield.synthetic.state import Item, Lamp, State
 from refield.synthetic.textures import to_linear, to_srgb
 
+_SEEDS = 2**32  # that the renderer knows
 _OLDEST_LLVM = 19  # an older one aborts the whole process on the first kernel
 _DEPTH = 5  # light path segments
 _PROBE = "import drjit; print(drjit.detail.llvm_version()[0])"
@@ -57,7 +58,7 @@ class PathTracer:
     def photo(self, camera: Camera, world_from_cam: Tensor, spp: int, seed: int) -> Tensor:
         """What an undistorted camera sees: (H, W, 3) float32 sRGB in [0, 1], ``spp`` paths a pixel."""
         sensor = self._mi.load_dict(_sensor(self._mi, camera, world_from_cam))
-        linear = np.array(self._mi.render(self._scene, sensor=sensor, spp=spp, seed=seed))[..., :3]
+        linear = np.array(self._mi.render(self._scene, sensor=sensor, spp=spp, seed=seed % _SEEDS))[..., :3]
         return torch.from_numpy(to_srgb(linear))
 
 

@@ -187,7 +187,7 @@ def other_face(rng: np.random.Generator, item: Item) -> Matrix | None:
 
 
 def top_of(item: Item) -> Top | None:
-    """The level rectangle on top of an object, if it has one of half its width."""
+    """A level rectangle on top of an object; None if it has none of three tenths of its width."""
     vertices = vertices_of(item.solid) @ rotation(item).T + item.world_from_item[:3, 3].numpy()
     highest = float(vertices[:, 2].max())
     on = vertices[vertices[:, 2] > highest - 1e-5]

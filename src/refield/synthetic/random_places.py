@@ -81,15 +81,15 @@ def draw_place(rng: np.random.Generator, *, outdoors: bool) -> Place:
     family = str(rng.choice(list(kinds), p=weights / weights.sum()))
     reach = float(rng.uniform(0.5, 1.2))
     kind, paint = random_textures.ground(rng, 1024 if outdoors else 768, outdoors=outdoors)
-    make = {
+    on_level: dict[str, _Furnish] = {
         "floor": _floor, "corner": _corner, "desk": _desk, "cluttered desk": _cluttered, "shelf": _shelf,
-        "steps": _steps, "slope": _rolling, "bowl": _rolling, "hills": _rolling,
-    }[family]  # fmt: skip
-    if make is _rolling:
-        place = _rolling(rng, reach, family, paint)
-    else:
-        place = make(rng, reach)  # type: ignore[operator]
+        "steps": _steps,
+    }  # fmt: skip
+    if family in on_level:
+        place = on_level[family](rng, reach)
         place = replace(place, items=(_level_ground(paint, _GROUND * reach, outdoors), *place.items))
+    else:
+        place = _rolling(rng, reach, family, paint)
     return replace(place, family=family, ground=kind)
 
 
@@ -232,7 +232,6 @@ def in_room(rng: np.random.Generator, place: Place, wide: float, high: float) ->
     names = [random_textures.wall(rng, 384)[1] for _ in range(int(rng.integers(1, 5)))]
     paints = [names[k % len(names)] for k in range(4)]
     white = np.full((8, 8, 3), 0.85, np.float32)
-    have = {item.name for item in place.items}
     floor = replace(place.items[0], solid=Box((wide, wide, t)))
     walls = [
         slab_item("room north", (-wide, wide, 0), (wide, wide + t, high), paints[0]),
@@ -241,4 +240,4 @@ def in_room(rng: np.random.Generator, place: Place, wide: float, high: float) ->
         slab_item("room west", (-wide - t, -wide, 0), (-wide, wide, high), paints[3]),
         slab_item("ceiling", (-wide, -wide, high), (wide, wide, high + t), white),
     ]
-    return replace(place, items=(floor, *place.items[1:], *(wall for wall in walls if wall.name not in have)))
+    return replace(place, items=(floor, *place.items[1:], *walls))

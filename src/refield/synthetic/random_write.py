@@ -22,7 +22,7 @@ from refield.scene.files import write_json
 from refield.scene.images import frame_image, write_image
 from refield.scene.transforms_json import NAME, save_transforms
 from refield.synthetic.disturb import Disturbance, disturbed_photo, disturbed_pose
-from refield.synthetic.pathtrace import PathTracer
+from refield.synthetic.pathtrace import PathTracer, mitsuba
 from refield.synthetic.random_worlds import RandomWorld, random_world
 from refield.synthetic.state import State
 from refield.synthetic.textures import to_linear, to_srgb
@@ -39,8 +39,9 @@ def write_random(out: Path, config: SynthConfig, on_progress: Progress | None = 
     """Render the random world of ``config.seed`` into the folder ``out``.
 
     Raises:
-        InputError: Mitsuba is not installed.
+        InputError: Mitsuba is not installed, or nothing that was drawn fitted.
     """
+    mitsuba()
     drawn = random_world(config.seed, config.photos)
     camera = drawn.camera.shrunk(config.size / max(drawn.camera.width, drawn.camera.height))
     factor = exposure_factor(drawn.world.before, camera, drawn.old, drawn.brightness)

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-_INSET = 0.02  # an atlas cell is used up to this part of its border, so that filtering stays inside it
+INSET = 0.02  # an atlas cell is used up to this part of its border, so that filtering stays inside it
 _SEGMENTS = 96  # of a mesh's circle; 0.02 cm off at a radius of 40 cm
 
 Mesh = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
@@ -69,7 +69,7 @@ class Box:
         side = (unit.gather(-1, axis[..., None])[..., 0] > 0).to(x.dtype)
         first = unit.gather(-1, ((axis + 1) % 3)[..., None])[..., 0].clamp(-1, 1)
         second = unit.gather(-1, ((axis + 2) % 3)[..., None])[..., 0].clamp(-1, 1)
-        scale = 0.5 * (1 - _INSET)
+        scale = 0.5 * (1 - INSET)
         return torch.stack([(axis + 0.5 + scale * first) / 3, (side + 0.5 - scale * second) / 2], -1)
 
     def mesh(self) -> Mesh:
@@ -153,14 +153,14 @@ class Cylinder:
     def uv(self, x: Tensor) -> Tensor:
         r, h = x[..., :2].norm(dim=-1), self.height / 2
         down = (0.5 - x[..., 2] / (2 * h)).clamp(0, 1)
-        side = torch.stack([_turn(x), 0.5 * (_INSET + (1 - 2 * _INSET) * down)], -1)
+        side = torch.stack([_turn(x), 0.5 * (INSET + (1 - 2 * INSET) * down)], -1)
         cap = _cap_uv(x, self.radius, x[..., 2] > 0)
         on_cap = x[..., 2].abs() - h > r - self.radius
         return torch.where(on_cap[..., None], cap, side)
 
     def mesh(self) -> Mesh:
         h = self.height / 2
-        v = 0.5 * np.array([1 - _INSET, _INSET])
+        v = 0.5 * np.array([1 - INSET, INSET])
         side = _revolved(np.full(2, self.radius), np.array([-h, h]), v)
         return _joined(side, _disc(self.radius, -h, False), _disc(self.radius, h, True))
 
@@ -217,13 +217,13 @@ class Cone:
 
     def uv(self, x: Tensor) -> Tensor:
         along, above = self._side(x)
-        v = 0.5 * (_INSET + (1 - 2 * _INSET) * (1 - along.clamp(0, 1)))
+        v = 0.5 * (INSET + (1 - 2 * INSET) * (1 - along.clamp(0, 1)))
         below = -(x[..., 2] + self.height / 2)
         cap = _cap_uv(x, self.radius, torch.zeros_like(below, dtype=torch.bool))
         return torch.where((below > above)[..., None], cap, torch.stack([_turn(x), v], -1))
 
     def mesh(self) -> Mesh:
-        h, v = self.height / 2, 0.5 * np.linspace(1 - _INSET, _INSET, 9)
+        h, v = self.height / 2, 0.5 * np.linspace(1 - INSET, INSET, 9)
         side = _revolved(np.linspace(self.radius, 0, 9), np.linspace(-h, h, 9), v)
         return _joined(side, _disc(self.radius, -h, False))
 
@@ -240,19 +240,19 @@ def _around(turn: Tensor, r: Tensor, z: Tensor) -> Tensor:
 
 def _down(v: Tensor) -> Tensor:
     """How far down a side the atlas row v lies: 0 at the top, 1 at the rim."""
-    return ((2 * v - _INSET) / (1 - 2 * _INSET)).clamp(0, 1)
+    return ((2 * v - INSET) / (1 - 2 * INSET)).clamp(0, 1)
 
 
 def _cap_at(uv: Tensor, radius: float, half_height: float) -> Tensor:
     top = uv[..., 0] >= 0.5
-    scale = 0.25 * (1 - _INSET) / radius
+    scale = 0.25 * (1 - INSET) / radius
     x = (uv[..., 0] - 0.25 - 0.5 * top) / scale
     y = (0.75 - uv[..., 1]) / scale
     return torch.stack([x, y, torch.where(top, half_height, -half_height)], -1)
 
 
 def _cap_uv(x: Tensor, radius: float, top: Tensor) -> Tensor:
-    scale = 0.25 * (1 - _INSET) / radius
+    scale = 0.25 * (1 - INSET) / radius
     u = 0.25 + 0.5 * top + scale * x[..., 0].clamp(-radius, radius)
     return torch.stack([u, 0.75 - scale * x[..., 1].clamp(-radius, radius)], -1)
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refield.synthetic.shapes import _INSET, Box, Mesh, Sphere
+from refield.synthetic.shapes import INSET, Box, Mesh, Sphere
 
 Point = tuple[float, float, float]
 
@@ -161,7 +161,7 @@ class Convex:
         flat = (axes @ x[..., None])[..., 0]
         unit = ((flat - bounds[..., 0, :]) / (bounds[..., 1, :] - bounds[..., 0, :])).clamp(0, 1)
         rows, columns = self.cells
-        inside = 0.5 + (1 - _INSET) * (unit - 0.5)
+        inside = 0.5 + (1 - INSET) * (unit - 0.5)
         u = (face % columns + inside[..., 0]) / columns
         v = (torch.div(face, columns, rounding_mode="floor") + 1 - inside[..., 1]) / rows
         return torch.stack([u, v], -1)

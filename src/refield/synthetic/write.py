@@ -33,7 +33,7 @@ CAMERAS = 180
 Progress = Callable[[int, int], None]
 """Called with the pictures done and their number."""
 Seen = Callable[[State, Frame], Tensor]
-"""Which item of a state each pixel's centre of a photo shows, (H, W) int64, -1 for none."""
+"""Which item of a state each pixel's centre of a photo shows, (H, W) integers, -1 for none."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class SynthConfig:
     photos: int | None = None
     """old photos of the world random; if not given, as many as its seed says, 30 to 120"""
     seed: int = 0
-    """of textures, surroundings and the paths"""
+    """of textures, surroundings and the paths; of everything in the world random"""
 
     def __post_init__(self) -> None:
         for name, least in (("size", 8), ("spp", 1), ("cameras", 10), ("photos", 10), ("seed", 0)):

@@ -1,0 +1,54 @@
+"""`refield rehearse`: what is done is told whatever comes after it."""
+
+import pytest
+import torch
+
+from refield.commands import rehearse
+from refield.commands.rehearse import Rehearse, Rehearsed
+from refield.field.fit import FitConfig
+from refield.rehearse.plan import NoRoomError
+from refield.rehearse.score import score_change
+from refield.scene.change import SceneChange
+
+FACTS = {"happening": "nothing", "changes": []}
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Runs the command; rehearsals take no time, and those of which an outcome is given end in it."""
+
+    def go(seeds, outcomes):
+        def rehearsed(scenery, folder, seed, clock, options):
+            folder.mkdir()
+            if seed in outcomes:
+                raise outcomes[seed]
+            score = score_change(SceneChange(), SceneChange())
+            return Rehearsed(seed, FACTS, 30.0, score, None, "", 1.0)
+
+        monkeypatch.setattr(rehearse, "prepared", lambda *_: (None, 1.0))
+        monkeypatch.setattr(rehearse, "rehearsed", rehearsed)
+        rehearse.run(Rehearse(tmp_path / "work", seeds, tmp_path / "out", fit=FitConfig()))
+
+    return go
+
+
+def test_one_that_there_is_no_room_for_is_left_out(run, tmp_path, capsys):
+    run("0..2", {1: NoRoomError("the rehearsal", "there is no free place", "give others")})
+    said = capsys.readouterr()
+    assert "rehearsal 1 is left out" in said.err and "2 of 2 rehearsals" in said.out
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["000", "002", rehearse.REPORT]
+
+
+def test_where_there_is_no_room_for_any_that_is_the_answer(run, capsys):
+    fault = NoRoomError("the rehearsal", "there is no free place", "give others")
+    with pytest.raises(NoRoomError):
+        run("0..1", {0: fault, 1: fault})
+    assert "rehearsals with" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("fault", [KeyboardInterrupt(), torch.OutOfMemoryError("no memory")])
+def test_what_is_done_is_told_when_it_is_interrupted(run, tmp_path, capsys, fault):
+    with pytest.raises(type(fault)):
+        run("0..2", {1: fault})
+    assert "1 of 1 rehearsals" in capsys.readouterr().out
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["000", rehearse.REPORT]
