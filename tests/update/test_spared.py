@@ -10,7 +10,7 @@ from refield.scene.change import ObjectChange
 from refield.update.composite import UpdatedField
 from refield.update.light import Relighting
 from refield.update.region import move_out
-from refield.update.spared import spared
+from refield.update.spared import Spared, spared
 from refield.update.supervision import Lessons
 from tests.update.worlds import Ball, BallWorld, at, change_of, grid_of, views
 
@@ -42,30 +42,40 @@ def lessons(factor: float = 1.0) -> tuple[Lessons, Tensor]:
 
 def test_light_that_is_wrong_is_left_out_and_the_rest_kept() -> None:
     updated = UpdatedField(BEFORE, CHANGE, helper=AFTER, light=DARK)
-    kept, left_out = spared(updated, *lessons())
-    assert left_out[0].part == LIGHT and left_out[0].gain > 3
-    assert kept.light is None and kept.helper is AFTER
+    kept = spared(updated, *lessons())
+    assert kept.left_out[0].part == LIGHT and kept.left_out[0].gain > 3
+    assert kept.field.light is None and kept.field.helper is AFTER
 
 
 def test_light_that_is_right_stays() -> None:
     updated = UpdatedField(BEFORE, CHANGE, helper=AFTER, light=DARK)
-    kept, left_out = spared(updated, *lessons(factor=float(torch.tensor(-0.4).exp())))
-    assert kept is updated and left_out == ()
+    kept = spared(updated, *lessons(factor=float(torch.tensor(-0.4).exp())))
+    assert kept.field is updated and kept.left_out == () and kept.lost == 0
 
 
 def test_a_helper_that_is_wrong_about_the_surroundings_keeps_to_what_left() -> None:
     updated = UpdatedField(BEFORE, CHANGE, helper=Tinted((BESIDE,)), region=move_out(CHANGE, 2.0))
     new, changed = lessons()
-    kept, left_out = spared(updated, new, changed)
-    assert [o.part for o in left_out] == [SURROUNDINGS]
-    assert kept.helper is updated.helper
+    kept = spared(updated, new, changed)
+    assert [o.part for o in kept.left_out] == [SURROUNDINGS]
+    assert kept.field.helper is updated.helper
     beside = torch.tensor([[-0.5, -0.2, 0.25], [-0.5, 0.2, 0.25]])  # inside the wide region only, inside both
-    assert updated.region.contains(beside).all() and kept.region.contains(beside).tolist() == [False, True]
+    assert updated.region.contains(beside).all() and kept.field.region.contains(beside).tolist() == [False, True]
 
 
 def test_what_no_pixel_contradicts_stays() -> None:
     updated = UpdatedField(BEFORE, CHANGE, helper=AFTER)
-    kept, left_out = spared(updated, *lessons())
-    assert kept is updated and left_out == ()
     new, changed = lessons()
-    assert spared(updated, new, torch.ones_like(changed)) == (updated, ())
+    new = Lessons(new.rays, render_many(updated, new.rays).rgb, new.photo, new.place)
+    assert spared(updated, new, changed) == Spared(updated)
+    assert spared(updated, new, torch.ones_like(changed)) == Spared(updated)
+
+
+def test_a_part_that_changed_pixels_need_stays_and_its_cost_is_told() -> None:
+    """Two in three pixels are as the helper has it, and did change; the others say that it is wrong."""
+    wrong = UpdatedField(BEFORE, CHANGE, helper=Tinted((BESIDE,)), region=move_out(CHANGE, 2.0))
+    new, _ = lessons()
+    changed = torch.arange(len(new)) % 3 > 0
+    rgb = torch.where(changed[:, None], render_many(wrong, new.rays).rgb, new.rgb)
+    kept = spared(wrong, Lessons(new.rays, rgb, new.photo, new.place), changed)
+    assert kept.field is wrong and kept.left_out == () and kept.lost > 1

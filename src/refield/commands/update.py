@@ -118,8 +118,8 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
         new = _updated(capture, old, change, options.update, clock)
         clock.stage("report")
         before, after = _shown(old, change), None if new is None else _shown(new, change)
-        for part in () if new is None else new.left_out:
-            clock.warn(f"left out of the update: {part}")
+        for note in () if new is None else new.notes:
+            clock.warn(note)
         evaluation = None
         if options.evaluation is not None:
             evaluation = evaluate(new or old, options.evaluation, old=old if new else None)

@@ -116,8 +116,8 @@ class UpdatedField:
         self.shading, self.eyes, self.bare = shading, eyes, bare
         self.why_stopped = ""
         """what ended the helper's training, in words; empty if it was not trained here"""
-        self.left_out: tuple[str, ...] = ()
-        """parts of the update that showed unchanged pixels worse and are not in it, in words"""
+        self.notes: tuple[str, ...] = ()
+        """what was left out when it was trained, and what it costs, in words"""
         if region is None:
             rest = self.to_learn
             region = carved(rest, SKIN * pretrained.sampler.step) if helper is None else move_out(rest, DILATION)

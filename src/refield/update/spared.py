@@ -34,7 +34,17 @@ class LeftOut:
     """dB that unchanged pixels are shown better without it, of those whose rays meet anything that it says"""
 
 
-def spared(updated: UpdatedField, new: Lessons, changed: Tensor) -> tuple[UpdatedField, tuple[LeftOut, ...]]:
+@dataclass(frozen=True)
+class Spared:
+    """What is kept of an update."""
+
+    field: UpdatedField
+    left_out: tuple[LeftOut, ...] = ()
+    lost: float = 0.0
+    """dB that the same pixels are shown worse than before all the same; 0 if they are not"""
+
+
+def spared(updated: UpdatedField, new: Lessons, changed: Tensor) -> Spared:
     """The update without the parts that show unchanged pixels worse; all of it, if the old field shows them no better.
 
     A part is left out if unchanged pixels, and all pixels together, are shown better without it; the one by which
@@ -50,7 +60,7 @@ def spared(updated: UpdatedField, new: Lessons, changed: Tensor) -> tuple[Update
         rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:_PIXELS]]
     asked, still = new[rows], ~changed[rows]
     if not still.any():
-        return updated, ()
+        return Spared(updated)
 
     def errors(field: Field) -> Tensor:
         return (render_many(field, asked.rays).rgb - asked.rgb).square().mean(-1)
@@ -68,7 +78,8 @@ def spared(updated: UpdatedField, new: Lessons, changed: Tensor) -> tuple[Update
         )
         updated, now = without[name], found[name]
         del parts[name]
-    return updated, tuple(left_out)
+    lost = 10 * float((now[still].mean() / (was[still].mean() + _ROUNDED)).clamp_min(1).log10())
+    return Spared(updated, tuple(left_out), lost)
 
 
 _Without = Callable[[UpdatedField], UpdatedField]

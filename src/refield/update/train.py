@@ -127,10 +127,13 @@ def update_field(
 
 
 def _without_harm(updated: UpdatedField, known: _Known) -> UpdatedField:
-    """The update without the parts of it that show unchanged pixels worse."""
-    kept, left_out = spared(updated, known.sparse, known.sparse.within(known.changed))
-    kept.left_out = tuple(f"{o.part} (unchanged pixels beside: {o.gain:.1f} dB better without it)" for o in left_out)
-    return kept
+    """The update without the parts of it that show unchanged pixels worse; ``notes`` says which, and what it costs."""
+    kept = spared(updated, known.sparse, known.sparse.within(known.changed))
+    notes = [f"left out of the update: {o.part} (unchanged pixels gain {o.gain:.1f} dB)" for o in kept.left_out]
+    if kept.lost > 0:
+        notes.append(f"unchanged pixels beside what changed are shown {kept.lost:.1f} dB worse than before")
+    kept.field.notes = tuple(notes)
+    return kept.field
 
 
 @dataclass(frozen=True)
