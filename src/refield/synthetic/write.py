@@ -74,7 +74,7 @@ def write_world(
         InputError: there is no such world, a number is out of range, or Mitsuba is not installed.
     """
     if name not in WORLDS:
-        raise InputError(f"world {name!r}", "there is no such world", f"choose random or one of {', '.join(WORLDS)}")
+        raise InputError(f"world {name!r}", "there is no such world", f"choose one of random, {', '.join(WORLDS)}")
     world = WORLDS[name](seed)
     photograph(world, out, SynthConfig(size, spp, cameras, seed=seed), on_progress)
     return world
