@@ -134,7 +134,8 @@ def test_photos_learnt_by_heart_are_begun_anew(capture: Capture, tmp_path: Path)
         return torch.nn.functional.interpolate(blocks, photo.shape[:2], mode="bilinear")[0].permute(1, 2, 0)
 
     few = replace(capture, frames=capture.frames[:20])
-    assert attempts(rephotographed(few, tmp_path, unrelated), replace(TINY, steps=510, check_every=1000)) == 5
+    short = replace(TINY, steps=510, samples=1024, check_every=1000, field=replace(TINY.field, levels=4))
+    assert attempts(rephotographed(few, tmp_path, unrelated), short) == 5
 
 
 def test_bad_photos_of_a_scene_are_fitted_once(capture: Capture, tmp_path: Path) -> None:

@@ -321,7 +321,7 @@ class _Fit:
             self.first = now
             return False
         taught, left_out = (b - a for a, b in zip(self.first, now))
-        return left_out < _BY_HEART * taught
+        return taught > 0 and left_out < _BY_HEART * taught
 
     def _step(self, step: int, progress: float) -> None:
         n = self.rays_per_step

@@ -42,6 +42,7 @@ _LIT_RAYS = 60_000  # of the new photos, for the light on all and on each object
 _NEW_RAYS = 1 << 18  # of the new photos, through the region; about as many as training draws
 _MADE = 20  # of the old photos that an earlier visit put out of date; each takes longer to put right than to learn from
 _GROUND_RAYS = 12_000  # that planes are looked for along
+_TOLD = 0.05  # dB; less is told as 0.0
 _RING_ASKED = 1 << 20  # of the old photos' pixels, whether their rays meet the region
 _RING_RAYS = 40_000  # of the old photos; more add time and nothing to learn
 
@@ -130,7 +131,7 @@ def _without_harm(updated: UpdatedField, known: _Known) -> UpdatedField:
     """The update without the parts of it that show unchanged pixels worse; ``notes`` says which, and what it costs."""
     kept = spared(updated, known.sparse, known.sparse.within(known.changed))
     notes = [f"left out of the update: {o.part} (unchanged pixels gain {o.gain:.1f} dB)" for o in kept.left_out]
-    if kept.lost > 0:
+    if kept.lost >= _TOLD:
         notes.append(f"unchanged pixels beside what changed are shown {kept.lost:.1f} dB worse than before")
     kept.field.notes = tuple(notes)
     return kept.field
