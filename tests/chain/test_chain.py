@@ -48,7 +48,8 @@ WORLDS = {
     "nothing": Floors((), untouched=33.5),
 }
 # One object that moved and one that left, photographed by hand (a seed for developing, 0 to 999). Fits by seeds 0 and 1
-# both begin anew and end in the same field (21.4 in, 25.7 out, 29.6 untouched): the margins are twice those of the worlds.
+# both begin anew and end in the same field (21.4 in, 25.7 out, 29.6 untouched): the margins are twice those of the
+# worlds.
 RANDOM = 38
 RANDOM_FLOORS = Floors(("moved", "removed"), psnr_in=19.8, psnr_out=23.2, untouched=28.5)
 # Real photographs with a box composited in; found half a turn off with both seeds (177° and 180°), so no angle is asked
