@@ -127,5 +127,7 @@ def test_bad_requests_are_refused_before_any_work(tmp_path):
 def test_any_seed_is_one_of_the_renderer(tracer):
     world = WORLDS["cube"](0)
     pose = ring(world.target)[0]
-    first, same = (tracer(world.before).photo(square_camera(8), pose, 1, seed) for seed in (7, 7 + 2**32))
-    assert torch.equal(first, same)
+    first, same, other = (tracer(world.before).photo(square_camera(8), pose, 1, s) for s in (7, 7 + 2**32, 8))
+    # threads add a pixel's samples in any order: the same photo to its last bits only
+    torch.testing.assert_close(first, same, atol=1e-4, rtol=0)
+    assert (first - other).abs().max() > 1e-2
