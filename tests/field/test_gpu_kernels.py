@@ -328,7 +328,8 @@ def test_contraction_and_harmonics() -> None:
 def step_parts(model: HashField, rays: int = 20) -> tuple:
     """What `train_step` asks for, but the gradients."""
     asked = question(0.3, rays)
-    batch = Batch(asked[0], torch.rand(rays, 3), torch.rand(rays, 3))
+    colours = torch.rand(rays, 3).masked_fill(torch.rand(rays, 3) < 0.2, 1.0)
+    batch = Batch(asked[0], colours, torch.rand(rays, 3), 0.5 + torch.rand(rays, 3), torch.rand(rays), rays // 2)
     field = (model.encoding.tables.detach(), model.encoding.resolutions, tuple(w.detach() for w in model.networks))
     return batch, *asked[1:], field, Aim(1e-2, 1.5, 7.0)
 
@@ -345,6 +346,8 @@ def test_train_step() -> None:
     fast = gpu.train_step(batch, *moved(parts[1:5]), parts[5], into)
     assert fast.loss == pytest.approx(truth.loss, rel=2e-3)
     assert_equal([(a, b.cpu()) for a, b in zip(expected, into)], rtol=2e-2 if ON_GPU else 1e-3, share=1e-2)
+    seen = zip((truth.shown, truth.errors, *truth.to_rays), (fast.shown, fast.errors, *fast.to_rays))
+    assert_equal([(a, b.cpu()) for a, b in seen], rtol=2e-2 if ON_GPU else 1e-3, share=1e-2)
     n, spare = len(fast.cells), 30
     again = zeros_for(moved(parts[4]))
     roomy = gpu.train_step(batch, *moved(parts[1:5]), parts[5], again, capacity=n + spare)

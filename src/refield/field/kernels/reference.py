@@ -34,6 +34,12 @@ class Batch(NamedTuple):
     """(N, 3) of the photos"""
     background: Tensor
     """(N, 3) shown where a ray stays transparent"""
+    gains: Tensor | None = None
+    """(N, 3) by which the photos multiply what is shown; 1 by default"""
+    trust: Tensor | None = None
+    """(N,) how much each ray's colours count; 1 by default"""
+    moving: int = 0
+    """so many rays, the first, tell how the loss changes with where they are"""
 
 
 class Aim(NamedTuple):
@@ -58,6 +64,12 @@ class Stepped(NamedTuple):
     sigmas: Tensor
     """(S,) per world unit"""
     rays: int
+    shown: Tensor | None = None
+    """(N, 3) what `train_step` composited, before gains, without the background"""
+    errors: Tensor | None = None
+    """(N, 3) what is seen less what the photos show; 0 where a photo is burnt out and what is seen is brighter"""
+    to_rays: tuple[Tensor, Tensor] | None = None
+    """d loss / d origin and / d direction, (moving, 3) each; the directions' part through the colours is left out"""
 
 
 class Fixed(NamedTuple):
@@ -84,6 +96,8 @@ class Unwanted(NamedTuple):
     """World points (S, 3) -> (S,) bool: where it is not asked. It must not march rays"""
 
 
+BURNT = 254.5 / 255
+"""a photo's colour above which it may have been brighter still"""
 PRIMES = (1, 2654435761, 805459861)  # the spatial hash of Teschner et al. 2003, as in Instant-NGP, Eq. 4
 
 
@@ -346,28 +360,42 @@ def train_step(
 ) -> Stepped:
     """March, evaluate, composite, compare and go back: adds d loss / d parameter to ``into`` (tables, five matrices).
 
-    loss = mean squared colour error (Eq. 2) + aim.distortion * mean distortion, distances in s = t / (t + radius).
+    loss = mean of trust times squared colour error (Eq. 2) + aim.distortion * mean distortion, distances in
+    s = t / (t + radius). The error is that of gains * shown + background, 0 where a photo is burnt out and less bright.
     """
     tables, resolutions, networks = field
     origins, directions, _ = batch.rays
     net = (tables.detach(), resolutions, networks[0].detach(), networks[1][0].detach())
     t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop)
     ids, mid = _ray_ids(offsets), (t0 + t1) / 2
-    unit = (contract(origins[ids] + directions[ids] * mid[:, None], *space) + 2) / 4
     leaves = [p.detach().requires_grad_() for p in (tables, *networks)]
+    ways = [r.detach().requires_grad_(batch.moving > 0) for r in (origins, directions)]
     with torch.enable_grad():
+        unit = (contract(ways[0][ids] + ways[1][ids] * mid[:, None], *space) + 2) / 4
         raw, rgbs = hash_field(unit, directions[ids], leaves[0], resolutions, tuple(leaves[1:]))  # type: ignore[arg-type]
         sigmas = truncated_exp(raw) / space[1]
         near = (mid / aim.gradient_unit).square().clamp(max=1)
         w = weights(scale_gradient(sigmas, near), t0, t1, offsets)
         shown = accumulate(w, torch.cat([scale_gradient(rgbs, near), torch.ones_like(w)[:, None]], -1), offsets)
-        rgb = shown[:, :3] + (1 - shown[:, 3:]) * batch.background
+        errors = compared(shown, batch)
         s0, s1 = (t / (t + space[1]) for t in (t0, t1))
-        loss = (rgb - batch.colours).square().mean() + aim.distortion * distortion(w, s0, s1, offsets).mean()
-    for total, grad in zip(into, torch.autograd.grad(loss, leaves)):
+        counts = 1.0 if batch.trust is None else batch.trust[:, None]
+        loss = (counts * errors.square()).mean() + aim.distortion * distortion(w, s0, s1, offsets).mean()
+    wanted = leaves + (ways if batch.moving else [])
+    grads = torch.autograd.grad(loss, wanted)
+    for total, grad in zip(into, grads):
         total += grad
-    cells = _cells(unit, grid.shape[0])
-    return Stepped(float(loss.detach()), cells, w.detach(), sigmas.detach(), len(offsets) - 1)
+    cells = _cells(unit.detach(), grid.shape[0])
+    to_rays = (grads[-2][: batch.moving], grads[-1][: batch.moving]) if batch.moving else None
+    told = shown[:, :3].detach(), errors.detach(), to_rays
+    return Stepped(float(loss.detach()), cells, w.detach(), sigmas.detach(), len(offsets) - 1, *told)
+
+
+def compared(shown: Tensor, batch: Batch) -> Tensor:
+    """What is composited, with its opacity (N, 4), less what the photos show (N, 3); see `Stepped.errors`."""
+    rgb = shown[:, :3] if batch.gains is None else shown[:, :3] * batch.gains
+    errors = rgb + (1 - shown[:, 3:]) * batch.background - batch.colours
+    return torch.where((batch.colours > BURNT) & (errors > 0), torch.zeros_like(errors), errors)
 
 
 def _cells(unit: Tensor, r: int) -> Tensor:
@@ -388,6 +416,7 @@ def woven_step(
     into: list[Tensor],
 ) -> Stepped:
     """`train_step` with fixed segments between the samples (Eq. 4); they count in the loss as samples of no length.
+    All photos count alike, as they are.
 
     The loss has one term more: the mean over rays of what the samples' weights add where they are unwanted.
     """

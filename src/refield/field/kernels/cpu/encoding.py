@@ -127,8 +127,10 @@ def encode(unit, tables, resolutions, out, parts):  # type: ignore[no-untyped-de
 @njit(parallel=True, **JIT)
 def encode_backward(unit, grad, resolutions, into):  # type: ignore[no-untyped-def]
     """Adds the gradient to tables ``into`` (L, T) of pairs; grad (S, L) of pairs."""
-    n = unit.shape[0]
-    for level in prange(into.shape[0]):
+    n, half = unit.shape[0], (into.shape[0] + 1) // 2
+    for i in prange(into.shape[0]):
+        # threads get runs of neighbours: let each have coarse levels, which stay in its cache, and fine ones
+        level = 2 * i if i < half else 2 * (i - half) + 1
         rows, wts = np.empty((8, BLOCK), np.uint32), np.empty((8, BLOCK), np.float32)
         table = into[level]
         for first in range(0, n, BLOCK):
@@ -142,7 +144,7 @@ def encode_backward(unit, grad, resolutions, into):  # type: ignore[no-untyped-d
 
 
 @njit(parallel=True, **JIT)
-def _encode_slope(unit, tables, resolutions, grad, out):  # type: ignore[no-untyped-def]
+def encode_slope(unit, tables, resolutions, grad, out):  # type: ignore[no-untyped-def]
     """Gradient with respect to the position, (S, 3)."""
     n = unit.shape[0]
     for b in prange((n + BLOCK - 1) // BLOCK):
@@ -189,7 +191,7 @@ class _HashEncode(Function):
         to_unit, to_tables = None, None
         if ctx.needs_input_grad[0]:
             to_unit = torch.empty_like(unit)
-            _encode_slope(array(unit), array(tables), ctx.resolutions, array(grad), to_unit.numpy())
+            encode_slope(array(unit), array(tables), ctx.resolutions, array(grad), to_unit.numpy())
         if ctx.needs_input_grad[1]:
             to_tables = torch.zeros(tables.shape)
             encode_backward(array(unit), array(grad).view(np.float64), ctx.resolutions, pairs(to_tables))

@@ -12,7 +12,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from refield.field.kernels.cpu.encoding import array, encode_backward, pairs, scratch
+from refield.field.kernels.cpu.encoding import array, encode_backward, encode_slope, pairs, scratch
 from refield.field.kernels.cpu.marching import Marched, marched
 from refield.field.kernels.cpu.networks import (
     BLOCK,
@@ -25,9 +25,11 @@ from refield.field.kernels.cpu.networks import (
     unpack,
 )
 from refield.field.kernels.cpu.simd import JIT, exp
-from refield.field.kernels.reference import Aim, Batch, Lattice, Networks, Space, Stepped
+from refield.field.kernels.reference import BURNT, Aim, Batch, Lattice, Networks, Space, Stepped
 
 _ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
+_BURNT = np.float32(BURNT)
+_TO_FEATURES = "to features"  # the scratch in which a step leaves the gradients of its samples' features
 
 
 @njit(**JIT)
@@ -46,15 +48,21 @@ def prepare(first, n, raw, t0, t1, radius, unit, sigma, scratch):  # type: ignor
         clear[k] = exp(-density * (b - a))
 
 
+@njit(forceinline=True, **JIT)
+def _off(seen, truth):  # type: ignore[no-untyped-def]
+    """Error of a colour; none where the photo is burnt out and what is seen is brighter."""
+    return _ZERO if truth > _BURNT and seen > truth else seen - truth
+
+
 @njit(**JIT)
 def _along_ray(first, n, at, rgb, scratch, aim, told, w, sigma, to_raw, to_rgb):  # type: ignore[no-untyped-def]
     """Composite a ray's n samples, compare, and write the gradients of the loss; returns the ray's share of the loss.
 
     ``rgb``, ``scratch``, ``to_raw`` and ``to_rgb`` are the block's, in which the ray begins at ``at``; w and sigma are
-    the step's, in which it begins at ``first``.
+    the step's, in which it begins at ``first``. ``told`` ends with where to write what is shown and the error, (3,) each.
     """
     radius, strength, _, rays = aim
-    truth, background = told
+    truth, background, gain, trust, shown, error = told
     passes, mids, lengths, nears, deltas = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
     red = green = blue = mass = moment = _ZERO
     clear = _ONE
@@ -65,12 +73,15 @@ def _along_ray(first, n, at, rgb, scratch, aim, told, w, sigma, to_raw, to_rgb):
         red, green, blue = red + w[j] * rgb[k, 0], green + w[j] * rgb[k, 1], blue + w[j] * rgb[k, 2]
         mass, moment = mass + w[j], moment + w[j] * mids[k]
     empty = _ONE - mass
-    d0 = red + empty * background[0] - truth[0]
-    d1 = green + empty * background[1] - truth[1]
-    d2 = blue + empty * background[2] - truth[2]
-    g = _TWO / (_THREE * rays)
+    d0 = _off(gain[0] * red + empty * background[0], truth[0])
+    d1 = _off(gain[1] * green + empty * background[1], truth[1])
+    d2 = _off(gain[2] * blue + empty * background[2], truth[2])
+    shown[0], shown[1], shown[2] = red, green, blue
+    error[0], error[1], error[2] = d0, d1, d2
+    g = _TWO * trust / (_THREE * rays)
     g0, g1, g2 = g * d0, g * d1, g * d2
     behind = g0 * background[0] + g1 * background[1] + g2 * background[2]
+    g0, g1, g2 = g0 * gain[0], g1 * gain[1], g2 * gain[2]
     spread = before = moment_before = total = _ZERO
     for i in range(n):  # to_raw holds dL / dw_i for now
         j, k = first + i, at + i
@@ -91,7 +102,7 @@ def _along_ray(first, n, at, rgb, scratch, aim, told, w, sigma, to_raw, to_rgb):
         total -= w[j] * to_raw[k]
         grown = min(sigma[j], np.float32(3e4) / radius)
         to_raw[k] = deltas[k] * (clear * to_raw[k] - total) * nears[k] * grown
-    return (d0 * d0 + d1 * d1 + d2 * d2) / (_THREE * rays) + strength * spread / rays
+    return trust * (d0 * d0 + d1 * d1 + d2 * d2) / (_THREE * rays) + strength * spread / rays
 
 
 @njit(**JIT)
@@ -110,7 +121,7 @@ def take_block(r, end, longest, directions, offsets, d):  # type: ignore[no-unty
 def _group(begin, end, found, batch, sizes, packed, aim, outs, sums):  # type: ignore[no-untyped-def]
     """Rays ``begin : end`` forward and back, some at a time; returns their share of the loss."""
     t0, t1, _, _, features, offsets = found
-    directions, colours, background = batch
+    directions, colours, background, gains, trust, shown, errors = batch
     w, sigma, to_features = outs
     longest = BLOCK
     for r in range(begin, end):
@@ -126,7 +137,7 @@ def _group(begin, end, found, batch, sizes, packed, aim, outs, sums):  # type: i
         forward_block(features[first : first + n], d[:n], sizes, packed, room)
         prepare(first, n, room[2][:, 0], t0, t1, aim[0], aim[2], sigma, scratch)
         for q in range(r, last):
-            told = (colours[q], background[q])
+            told = (colours[q], background[q], gains[q], trust[q], shown[q], errors[q])
             loss += _along_ray(
                 offsets[q], offsets[q + 1] - offsets[q], offsets[q] - first,
                 room[5], scratch, aim, told, w, sigma, to_raw, to_rgb,
@@ -169,13 +180,19 @@ def after_march(
     into: list[Tensor],
 ) -> Stepped:
     """The rest of the step, for the samples that marching found; ``resolution``: cells a side of the grid."""
-    told = (array(batch.rays[1]), array(batch.colours), array(batch.background))
+    rays = len(batch.colours)
+    gains = np.ones((rays, 3), np.float32) if batch.gains is None else array(batch.gains)
+    trust = np.ones(rays, np.float32) if batch.trust is None else array(batch.trust)
+    shown, errors = torch.empty(rays, 3), torch.empty(rays, 3)
+    told = (array(batch.rays[1]), array(batch.colours), array(batch.background), gains, trust)
 
     def through(*rest):  # type: ignore[no-untyped-def]
-        _through(tuple(found), told, *rest)
+        _through(tuple(found), (*told, shown.numpy(), errors.numpy()), *rest)
 
-    rays = len(batch.colours)
-    return scattered(found, find_cells(found.unit, resolution), rays, field, toward(aim, space, rays), into, through)
+    cells = find_cells(found.unit, resolution)
+    done = scattered(found, cells, rays, field, toward(aim, space, rays), into, through)
+    to_rays = ray_gradients(found, batch, space, field[0], field[1]) if batch.moving else None
+    return done._replace(shown=shown, errors=errors, to_rays=to_rays)
 
 
 def toward(aim: Aim, space: Space, rays: int) -> tuple[np.float32, ...]:
@@ -199,7 +216,7 @@ def scattered(
     packed = pack(networks)
     sums = group_sums(packed)
     w, sigmas, losses = torch.empty(n), torch.empty(n), np.zeros(sums[0].shape[0])
-    to_features = scratch("to features", found.features.shape)
+    to_features = scratch(_TO_FEATURES, found.features.shape)
     outs = (w.numpy(), sigmas.numpy(), to_features)
     bounds = np.searchsorted(found.offsets, n * np.arange(len(losses) + 1) // len(losses))
     bounds[-1] = rays  # those without a sample, too
@@ -208,6 +225,58 @@ def scattered(
     for total, grad in zip(into[1:], unpack(tuple(s.sum(0) for s in sums), networks)):
         total += grad
     return Stepped(float(losses.sum()), cells, w, sigmas, rays)
+
+
+def ray_gradients(
+    found: Marched, batch: Batch, space: Space, tables: Tensor, resolutions: tuple[int, ...]
+) -> tuple[Tensor, Tensor]:
+    """How the loss changes with origins and directions of the first rays of the step just taken, (moving, 3) each."""
+    rays, ends = batch.moving, found.offsets
+    n = int(ends[rays])
+    to_unit = scratch("to unit", (n, 3))
+    to_features = scratch(_TO_FEATURES, found.features.shape)
+    res = np.asarray(resolutions, np.int32)
+    encode_slope(found.unit[:n], array(tables), res, to_features[:n], to_unit)
+    to_origins, to_directions = torch.empty(rays, 3), torch.empty(rays, 3)
+    lines, place = (array(batch.rays[0]), array(batch.rays[1])), (array(space[0].float()), np.float32(space[1]))
+    told = (found.t_starts, found.t_ends, ends)
+    _to_rays(lines, place, told, to_unit, to_origins.numpy(), to_directions.numpy())
+    return to_origins, to_directions
+
+
+@njit(parallel=True, **JIT)
+def _to_rays(lines, space, told, to_unit, to_origins, to_directions):  # type: ignore[no-untyped-def]
+    for r in prange(len(to_origins)):
+        _to_ray(r, lines, space, told, to_unit, to_origins[r], to_directions[r])
+
+
+@njit(**JIT)
+def _to_ray(r, lines, space, told, to_unit, to_origin, to_direction):  # type: ignore[no-untyped-def]
+    """Sums one ray's samples: their places go through the contraction, (y + 2) / 4 of which is the unit cube."""
+    t0, t1, offsets = told
+    centre, radius = space
+    u, g = np.empty(3, np.float32), np.empty(3, np.float32)
+    to_origin[:], to_direction[:] = _ZERO, _ZERO
+    for i in range(offsets[r], offsets[r + 1]):
+        mid = (t0[i] + t1[i]) / _TWO
+        m, axis = _ZERO, 0
+        for a in range(3):
+            u[a] = (lines[0][r, a] + lines[1][r, a] * mid - centre[a]) / radius
+            if abs(u[a]) > m:
+                m, axis = abs(u[a]), a
+        scale, along = np.float32(0.25) / radius, _ZERO
+        for a in range(3):
+            g[a] = to_unit[i, a] * scale
+            along += g[a] * u[a]
+        if m > 1:
+            k = (_TWO - _ONE / m) / m
+            bend = (_TWO / (m * m * m) - _TWO / (m * m)) * along
+            for a in range(3):
+                g[a] *= k
+            g[axis] += bend if u[axis] > 0 else -bend
+        for a in range(3):
+            to_origin[a] += g[a]
+            to_direction[a] += mid * g[a]
 
 
 def find_cells(unit: np.ndarray, resolution: int) -> Tensor:

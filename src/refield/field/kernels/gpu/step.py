@@ -8,7 +8,17 @@ from torch import Tensor
 from refield.field.kernels.gpu.marching import march_visible
 from refield.field.kernels.gpu.networks import hash_field
 from refield.field.kernels.gpu.rays import accumulate, contract, distortion, ray_ids, weights
-from refield.field.kernels.reference import Aim, Batch, Lattice, Networks, Space, Stepped, scale_gradient, truncated_exp
+from refield.field.kernels.reference import (
+    Aim,
+    Batch,
+    Lattice,
+    Networks,
+    Space,
+    Stepped,
+    compared,
+    scale_gradient,
+    truncated_exp,
+)
 
 
 def train_step(
@@ -33,28 +43,33 @@ def train_step(
     t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop, capacity=capacity)
     ids, mid = ray_ids(offsets, len(t0)), (t0 + t1) / 2
     d = directions[ids]
-    unit = (contract(origins[ids] + d * mid[:, None], *space) + 2) / 4
     whole = torch.ones_like(offsets[1:]) if capacity is None else offsets[1:] < capacity
     share = whole / whole.sum().clamp_min(1)
     leaves = [p.detach().requires_grad_() for p in (tables, *networks)]
+    ways = [r.detach().requires_grad_(batch.moving > 0) for r in (origins, directions)]
     with torch.enable_grad():
+        unit = (contract(ways[0][ids] + ways[1][ids] * mid[:, None], *space) + 2) / 4
         raw, rgbs = hash_field(unit, d, leaves[0], resolutions, tuple(leaves[1:]))  # type: ignore[arg-type]
         sigmas = truncated_exp(raw) / space[1]
         near = (mid / aim.gradient_unit).square().clamp(max=1)
         w = weights(scale_gradient(sigmas, near), t0, t1, offsets)
         shown = accumulate(w, torch.cat([scale_gradient(rgbs, near), torch.ones_like(w)[:, None]], -1), offsets)
-        rgb = shown[:, :3] + (1 - shown[:, 3:]) * batch.background
+        errors = compared(shown, batch)
         s0, s1 = (t / (t + space[1]) for t in (t0, t1))
-        each = (rgb - batch.colours).square().mean(-1) + aim.distortion * distortion(w, s0, s1, offsets)
+        off = errors.square().mean(-1)
+        each = (off if batch.trust is None else batch.trust * off) + aim.distortion * distortion(w, s0, s1, offsets)
         loss = (share * each).sum()
-    for total, grad in zip(into, torch.autograd.grad(loss, leaves)):
+    grads = torch.autograd.grad(loss, leaves + (ways if batch.moving else []))
+    for total, grad in zip(into, grads):
         total += grad
     side = grid.shape[0]
-    ijk = (unit * side).long().clamp_(0, side - 1)
+    ijk = (unit.detach() * side).long().clamp_(0, side - 1)
     cells = (ijk[:, 0] * side + ijk[:, 1]) * side + ijk[:, 2]
     w, sigmas, loss = w.detach(), sigmas.detach(), loss.detach()
+    to_rays = (grads[-2][: batch.moving], grads[-1][: batch.moving]) if batch.moving else None
+    told = shown[:, :3].detach(), errors.detach(), to_rays
     if capacity is None:
-        return Stepped(float(loss), cells, w, sigmas, len(offsets) - 1)
+        return Stepped(float(loss), cells, w, sigmas, len(offsets) - 1, *told)
     real = torch.arange(capacity, device=w.device) < offsets[-1]
     w, sigmas = torch.where(real, w, -1.0), torch.where(real, sigmas, -1.0)
-    return Stepped(loss, cells, w, sigmas, len(offsets) - 1)  # type: ignore[arg-type]
+    return Stepped(loss, cells, w, sigmas, len(offsets) - 1, *told)  # type: ignore[arg-type]
