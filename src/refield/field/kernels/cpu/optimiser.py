@@ -13,21 +13,8 @@ from refield.field.kernels.cpu.encoding import array
 from refield.field.kernels.cpu.simd import JIT, exp
 
 _BLOCK = 1 << 14
+_LINE = 16  # floats
 _ONE = np.float32(1)
-
-
-@njit(parallel=True, **JIT)
-def _adam(param, grad, first, second, scale):  # type: ignore[no-untyped-def]
-    part1, part2, eps = np.float32(0.1), np.float32(0.01), np.float32(1e-15)
-    for b in prange((len(param) + _BLOCK - 1) // _BLOCK):
-        for i in range(b * _BLOCK, min(len(param), (b + 1) * _BLOCK)):
-            g = grad[i]
-            touched = np.float32(g != 0)  # a factor, not a branch: the loop is one run of vectors at memory speed
-            m = first[i] + touched * part1 * (g - first[i])
-            v = second[i] + touched * part2 * (g * g - second[i])
-            first[i], second[i] = m, v
-            param[i] -= touched * scale * m / (math.sqrt(v) + eps)
-            grad[i] = 0
 
 
 @njit(**JIT)
@@ -41,11 +28,43 @@ def _adam_small(param, grad, first, second, scale):  # type: ignore[no-untyped-d
         grad[i] = 0
 
 
+@njit(**JIT)
+def _adam_line(first_float, param, grad, bits, first, second, scale):  # type: ignore[no-untyped-def]
+    """A cache line of each array: nothing but the gradient is fetched where nothing was touched, as in most of a large
+    table in any one step."""
+    part1, part2, eps = np.float32(0.1), np.float32(0.01), np.float32(1e-15)
+    seen = np.int32(0)
+    for i in range(first_float, first_float + _LINE):
+        seen |= bits[i]
+    if seen == 0:
+        return
+    for i in range(first_float, first_float + _LINE):
+        g = grad[i]
+        touched = np.float32(g != 0)  # a factor, not a branch: the loop is one run of vectors
+        m = first[i] + touched * part1 * (g - first[i])
+        v = second[i] + touched * part2 * (g * g - second[i])
+        first[i], second[i] = m, v
+        param[i] -= touched * scale * m / (math.sqrt(v) + eps)
+        grad[i] = 0
+
+
+@njit(parallel=True, **JIT)
+def _adam(param, grad, bits, first, second, scale):  # type: ignore[no-untyped-def]
+    whole = len(param) // _LINE * _LINE
+    for b in prange((whole + _BLOCK - 1) // _BLOCK):
+        for i in range(b * _BLOCK, min(whole, (b + 1) * _BLOCK), _LINE):
+            _adam_line(i, param, grad, bits, first, second, scale)
+    _adam_small(param[whole:], grad[whole:], first[whole:], second[whole:], scale)
+
+
 def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, step: int) -> None:
     """See `reference.adam`."""
     scale = rate * math.sqrt(1 - 0.99**step) / (1 - 0.9**step)
     flat = [array(t).reshape(-1) for t in (param, grad, first, second)]
-    (_adam if param.numel() > _BLOCK else _adam_small)(*flat, np.float32(scale))
+    if param.numel() > _BLOCK:
+        _adam(*flat[:2], flat[1].view(np.int32), *flat[2:], np.float32(scale))
+    else:
+        _adam_small(*flat, np.float32(scale))
 
 
 @njit(**JIT)
