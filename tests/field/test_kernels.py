@@ -210,6 +210,9 @@ def test_train_step(fill: float, scale: float, rays: int) -> None:
     assert difference.abs().sum() <= 4 + 0.01 * len(truth.cells)
     for mine, true in zip((*grads, fast.shown, fast.errors), (*true_grads, truth.shown, truth.errors)):
         assert (mine - true).norm() <= 1e-2 * true.norm()
+    assert (fast.weights[fast.heaviest] - truth.weights[truth.heaviest]).abs().median() < 1e-5 if len(fast.weights) else (
+        fast.heaviest.eq(-1).all() and truth.heaviest.eq(-1).all()
+    )
     for mine, true in zip(fast.to_rays, truth.to_rays):
         # where a sample fell to the other side of a cell's border its slope is another's
         off = (mine - true).norm(dim=-1) > 1e-2 * true.norm(dim=-1) + 1e-4 * true.norm()

@@ -14,8 +14,9 @@ from torch import Tensor
 from refield.field import kernels
 from refield.field.coverage import knowable
 from refield.field.encoding import Contraction, large_zeros
-from refield.field.kernels.reference import Aim, Batch
+from refield.field.kernels.reference import Aim
 from refield.field.occupancy import OccupancyTrainer
+from refield.field.photo_model import PhotoModel, PhotoModelConfig
 from refield.field.photos import UNCHANGED, Photos, Since
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.sampling import RESOLUTION, STOP, OccupancySampler
@@ -51,6 +52,8 @@ class FitConfig:
     """looks without ``least_gain`` after which training stops"""
     least_gain: float = 0.02
     """dB"""
+    photos: PhotoModelConfig = field(default_factory=PhotoModelConfig)
+    """what is found out about the photos, beside the field"""
     seed: int = 0
     photo_memory: float | None = None
     """GB for the photos' pixels; of more than fit, a part is kept, drawn from every photo alike"""
@@ -269,6 +272,7 @@ class _Fit:
     ) -> None:
         self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
         self.pixels, self.judge = photos.bank(), photos.judge()
+        self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model)
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
@@ -325,18 +329,17 @@ class _Fit:
 
     def _step(self, step: int, progress: float) -> None:
         n = self.rays_per_step
-        chosen = torch.randint(len(self.pixels), (n,))
-        rays = self.pixels.rays(chosen)
-        # what stays transparent is shown noise, so that only opaque surfaces explain the photos
-        batch = Batch((rays.origins, rays.directions, torch.rand(n)), self.pixels.colours(chosen), torch.rand(n, 3))
+        asked = self.photos.ask(torch.randint(len(self.pixels), (n,)), progress)
         model, sampler = self.model, self.model.sampler
         space = (sampler.contraction.centre, sampler.contraction.radius)
         aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
-        done = kernels.train_step(batch, space, sampler.grid, sampler.lattice, field, aim, self.adam.grads)
-        if self.adam.step(self.config.rate * rate_factor(progress), done.loss):
+        done = kernels.train_step(asked.batch, space, sampler.grid, sampler.lattice, field, aim, self.adam.grads)
+        rate = rate_factor(progress)
+        if self.adam.step(self.config.rate * rate, done.loss):
             self.loss = done.loss if math.isnan(self.loss) else self.loss + 0.03 * (done.loss - self.loss)
             self.occupancy.observe(step, done.cells, done.weights, done.sigmas)
+            self.photos.learn(asked, done, progress, rate)
         self._resize(n, len(done.weights))
 
     def _resize(self, rays: int, samples: int) -> None:

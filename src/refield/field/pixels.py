@@ -71,13 +71,17 @@ class PixelBank:
     def rays(self, pixels: Tensor) -> Rays:
         """World rays through pixel centres, (B,) -> Rays of B."""
         owner = self.frame_of(pixels)
+        world = (self._rotations[owner] @ self.camera_directions(pixels, owner)[:, :, None])[:, :, 0]
+        return Rays(self._centres[owner], world)
+
+    def camera_directions(self, pixels: Tensor, owner: Tensor) -> Tensor:
+        """Unit directions in camera axes through the centres of pixels (B,) of photos ``owner`` (B,), (B, 3)."""
         local = self._place_of(pixels, owner)
         d = torch.empty(len(pixels), 3)
         for k, camera in enumerate(self._cameras):
             mine = slice(None) if len(self._cameras) == 1 else (self._camera_of[owner] == k).nonzero()[:, 0]
             d[mine] = self._directions(camera, local[mine])
-        world = (self._rotations[owner] @ d[:, :, None])[:, :, 0]
-        return Rays(self._centres[owner], world)
+        return d
 
     def colours(self, pixels: Tensor) -> Tensor:
         """(B,) -> (B, 3) float32 in [0, 1]."""

@@ -68,6 +68,8 @@ class Stepped(NamedTuple):
     """(N, 3) what `train_step` composited, before gains, without the background"""
     errors: Tensor | None = None
     """(N, 3) what is seen less what the photos show; 0 where a photo is burnt out and what is seen is brighter"""
+    heaviest: Tensor | None = None
+    """(N,) int64, the sample of each ray that shows most; -1 where a ray has none"""
     to_rays: tuple[Tensor, Tensor] | None = None
     """d loss / d origin and / d direction, (moving, 3) each; the directions' part through the colours is left out"""
 
@@ -387,8 +389,17 @@ def train_step(
         total += grad
     cells = _cells(unit.detach(), grid.shape[0])
     to_rays = (grads[-2][: batch.moving], grads[-1][: batch.moving]) if batch.moving else None
-    told = shown[:, :3].detach(), errors.detach(), to_rays
+    told = shown[:, :3].detach(), errors.detach(), heaviest(w.detach(), offsets), to_rays
     return Stepped(float(loss.detach()), cells, w.detach(), sigmas.detach(), len(offsets) - 1, *told)
+
+
+def heaviest(w: Tensor, offsets: Tensor) -> Tensor:
+    """The sample of each ray with the greatest weight (S,), the first of several; (N,) int64, -1 where there is none."""
+    ids = _ray_ids(offsets)
+    most = w.new_zeros(len(offsets) - 1).scatter_reduce_(0, ids, w[: len(ids)], "amax")
+    found = torch.full((len(offsets) - 1,), -1, dtype=torch.long, device=w.device)
+    rows = (w[: len(ids)] == most[ids]).nonzero()[:, 0].flip(0)
+    return found.scatter_(0, ids[rows], rows)
 
 
 def compared(shown: Tensor, batch: Batch) -> Tensor:

@@ -59,16 +59,20 @@ def _along_ray(first, n, at, rgb, scratch, aim, told, w, sigma, to_raw, to_rgb):
     """Composite a ray's n samples, compare, and write the gradients of the loss; returns the ray's share of the loss.
 
     ``rgb``, ``scratch``, ``to_raw`` and ``to_rgb`` are the block's, in which the ray begins at ``at``; w and sigma are
-    the step's, in which it begins at ``first``. ``told`` ends with where to write what is shown and the error, (3,) each.
+    the step's, in which it begins at ``first``. ``told`` ends with where to write
+    what is shown and the error, (3,) each, and the heaviest sample, (1,).
     """
     radius, strength, _, rays = aim
-    truth, background, gain, trust, shown, error = told
+    truth, background, gain, trust, shown, error, heaviest = told
     passes, mids, lengths, nears, deltas = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
-    red = green = blue = mass = moment = _ZERO
+    red = green = blue = mass = moment = most = _ZERO
     clear = _ONE
+    heaviest[0] = -1
     for i in range(n):
         j, k = first + i, at + i
         w[j] = clear * (_ONE - passes[k])
+        if w[j] > most or heaviest[0] < 0:
+            most, heaviest[0] = w[j], j
         clear *= passes[k]
         red, green, blue = red + w[j] * rgb[k, 0], green + w[j] * rgb[k, 1], blue + w[j] * rgb[k, 2]
         mass, moment = mass + w[j], moment + w[j] * mids[k]
@@ -121,7 +125,7 @@ def take_block(r, end, longest, directions, offsets, d):  # type: ignore[no-unty
 def _group(begin, end, found, batch, sizes, packed, aim, outs, sums):  # type: ignore[no-untyped-def]
     """Rays ``begin : end`` forward and back, some at a time; returns their share of the loss."""
     t0, t1, _, _, features, offsets = found
-    directions, colours, background, gains, trust, shown, errors = batch
+    directions, colours, background, gains, trust, shown, errors, heaviest = batch
     w, sigma, to_features = outs
     longest = BLOCK
     for r in range(begin, end):
@@ -137,7 +141,7 @@ def _group(begin, end, found, batch, sizes, packed, aim, outs, sums):  # type: i
         forward_block(features[first : first + n], d[:n], sizes, packed, room)
         prepare(first, n, room[2][:, 0], t0, t1, aim[0], aim[2], sigma, scratch)
         for q in range(r, last):
-            told = (colours[q], background[q], gains[q], trust[q], shown[q], errors[q])
+            told = (colours[q], background[q], gains[q], trust[q], shown[q], errors[q], heaviest[q : q + 1])
             loss += _along_ray(
                 offsets[q], offsets[q + 1] - offsets[q], offsets[q] - first,
                 room[5], scratch, aim, told, w, sigma, to_raw, to_rgb,
@@ -183,16 +187,16 @@ def after_march(
     rays = len(batch.colours)
     gains = np.ones((rays, 3), np.float32) if batch.gains is None else array(batch.gains)
     trust = np.ones(rays, np.float32) if batch.trust is None else array(batch.trust)
-    shown, errors = torch.empty(rays, 3), torch.empty(rays, 3)
+    shown, errors, heaviest = torch.empty(rays, 3), torch.empty(rays, 3), torch.empty(rays, dtype=torch.long)
     told = (array(batch.rays[1]), array(batch.colours), array(batch.background), gains, trust)
 
     def through(*rest):  # type: ignore[no-untyped-def]
-        _through(tuple(found), (*told, shown.numpy(), errors.numpy()), *rest)
+        _through(tuple(found), (*told, shown.numpy(), errors.numpy(), heaviest.numpy()), *rest)
 
     cells = find_cells(found.unit, resolution)
     done = scattered(found, cells, rays, field, toward(aim, space, rays), into, through)
     to_rays = ray_gradients(found, batch, space, field[0], field[1]) if batch.moving else None
-    return done._replace(shown=shown, errors=errors, to_rays=to_rays)
+    return done._replace(shown=shown, errors=errors, heaviest=heaviest, to_rays=to_rays)
 
 
 def toward(aim: Aim, space: Space, rays: int) -> tuple[np.float32, ...]:

@@ -67,7 +67,7 @@ def train_step(
     cells = (ijk[:, 0] * side + ijk[:, 1]) * side + ijk[:, 2]
     w, sigmas, loss = w.detach(), sigmas.detach(), loss.detach()
     to_rays = (grads[-2][: batch.moving], grads[-1][: batch.moving]) if batch.moving else None
-    told = shown[:, :3].detach(), errors.detach(), to_rays
+    told = shown[:, :3].detach(), errors.detach(), None, to_rays
     if capacity is None:
         return Stepped(float(loss), cells, w, sigmas, len(offsets) - 1, *told)
     real = torch.arange(capacity, device=w.device) < offsets[-1]

@@ -1,0 +1,101 @@
+"""What is found out about the photos while a field is fitted to them: how each was exposed, where it was taken, and
+which parts of it show what no other photo does. All of it stands beside the field, none in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from refield.field.exposures import ExposureFit, basis_of
+from refield.field.kernels.reference import Batch, Stepped
+from refield.field.pixels import PixelBank
+from refield.field.poses import PoseFit
+from refield.field.sampling import OccupancySampler
+from refield.field.trust import PhotoTrust
+from refield.scene.capture import Frame, Rays
+from refield.scene.exposure import Exposure
+
+_EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.02, 0.1, 0.1  # of a fit: what is asked of it must be there first
+_MOVING = 4  # every so-many-th ray tells how poses are wrong
+
+
+@dataclass(frozen=True)
+class PhotoModelConfig:
+    """What a fit finds out about its photos."""
+
+    exposures: bool = False
+    """exposure and white balance of each photo, vignetting of each camera"""
+    poses: bool = False
+    """where each photo was taken and what its lens is, a few pixels around what is given"""
+    trust: bool = False
+    """parts of single photos that show what no other does count for less"""
+
+
+class Asked(NamedTuple):
+    """A step's rays, and what the model has to remember of them until it hears what came of them."""
+
+    batch: Batch
+    rays: Rays
+    pixels: Tensor
+    owner: Tensor
+    basis: Tensor | None
+    patches: Tensor | None
+
+
+class PhotoModel:
+    """See the module."""
+
+    def __init__(self, bank: PixelBank, sampler: OccupancySampler, config: PhotoModelConfig) -> None:
+        self.bank = bank
+        frames = bank.frames
+        distance = torch.stack([f.centre.float() - sampler.contraction.centre for f in frames]).norm(dim=-1).median()
+        self.exposures = ExposureFit(frames) if config.exposures else None
+        self.poses = PoseFit(frames, float(distance)) if config.poses else None
+        self.trust = PhotoTrust(bank, sampler.resolution**3) if config.trust else None
+
+    def ask(self, pixels: Tensor, progress: float) -> Asked:
+        """Rays of pixels (N,) as they stand, with the photos' gains and trust; ``progress`` of the fit in [0, 1]."""
+        bank, n = self.bank, len(pixels)
+        owner = bank.frame_of(pixels)
+        if self.poses is None:
+            rays = bank.rays(pixels)
+        else:
+            rays = self.poses.rays(owner, bank.camera_directions(pixels, owner))
+        gains = basis = patches = trust = None
+        if self.exposures is not None:
+            basis = basis_of(bank, pixels, owner)
+            gains = self.exposures.gains(owner, basis)
+        if self.trust is not None and progress >= _TRUSTED_FROM:
+            patches = self.trust.patches(pixels, owner)
+            trust = self.trust.trust[patches]
+        moving = n // _MOVING if self.poses is not None and progress >= _POSED_FROM else 0
+        # what stays transparent is shown noise, so that only opaque surfaces explain the photos
+        lines = (rays.origins, rays.directions, torch.rand(n))
+        batch = Batch(lines, bank.colours(pixels), torch.rand(n, 3), gains, trust, moving)
+        return Asked(batch, rays, pixels, owner, basis, patches)
+
+    def learn(self, asked: Asked, done: Stepped, progress: float, rate: float) -> None:
+        """Take in what a step found; ``rate`` in [0, 1] falls as the fit's."""
+        batch, owner = asked.batch, asked.owner
+        if self.exposures is not None and asked.basis is not None and progress >= _EXPOSED_FROM:
+            assert batch.gains is not None and done.shown is not None and done.errors is not None
+            weight = 1.0 if batch.trust is None else batch.trust[:, None]
+            self.exposures.learn(owner, asked.basis, batch.gains * done.shown, weight * done.errors, rate)
+        if self.poses is not None and done.to_rays is not None:
+            self.poses.learn(owner, asked.rays, done.to_rays, rate)
+        if self.trust is not None and asked.patches is not None:
+            assert done.heaviest is not None and done.errors is not None
+            surface = torch.where(done.heaviest >= 0, done.cells[done.heaviest.clamp_min(0)], -1)
+            self.trust.learn(asked.patches, surface, done.errors)
+
+    def frames(self) -> tuple[Frame, ...]:
+        """The training frames as the fit found them: poses, lenses."""
+        return self.bank.frames if self.poses is None else self.poses.found()
+
+    def found_exposures(self) -> tuple[Exposure, ...] | None:
+        """Of each training frame; None if none were asked for."""
+        return None if self.exposures is None else self.exposures.found()
