@@ -103,17 +103,20 @@ def test_what_is_there_tells_how_near_things_are(part) -> None:
     camera = Camera(120, 90, 100.0, 100.0, 60.0, 45.0)
     pose = rigid(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
     generator = torch.Generator().manual_seed(0)
-    wall = torch.rand(80_000, 3, generator=generator, dtype=torch.float64) * torch.tensor(
-        [12.0, 9.0, 0]
-    ) + torch.tensor([-6.0, -4.5, 4.0])
-    air = torch.rand(30, 3, generator=generator, dtype=torch.float64) * 0.05 + torch.tensor([0, 0, 1.0])
+    wall = torch.rand(80_000, 3, generator=generator, dtype=torch.float64)
+    wall = wall * torch.tensor([12.0, 9.0, 0]) + torch.tensor([-6.0, -4.5, 4.0])
+    air = torch.rand(3000, 3, generator=generator, dtype=torch.float64) * 0.05 + torch.tensor([0, 0, 1.0])
     behind = wall * torch.tensor([1.0, 1.0, -1.0])
-    near = f.nearest(torch.cat([wall, air, behind]), camera, pose)
+    by = torch.arange(30).repeat(80_000)[:80_000]
+    near = f.nearest(f.Points(torch.cat([wall, air, behind]), torch.cat([by, 0 * by[:3000], by])), camera, pose)
     assert near.shape == (90, 120) and bool(near.isfinite().all())
-    middle = float(near[45, 60])
-    assert middle == pytest.approx(4.0, rel=0.02)  # the few points in the air move it little
+    assert float(near[45, 60]) == pytest.approx(4.0, rel=0.02)  # most points are in the air, but one photo's alone
     assert float(near[0, 0]) == pytest.approx(math.hypot(4, 0.57 * 4, 0.43 * 4), rel=0.06)
-    assert not bool(f.nearest(behind, camera, pose).isfinite().any())
+    many = f.nearest(f.Points(torch.cat([wall, air]), torch.cat([by, by[:3000]])), camera, pose)
+    assert float(many[45, 60]) < 1.1  # all photos show it: it is there
+    assert not bool(f.nearest(f.Points(behind, by), camera, pose).isfinite().any())
+    nothing = f.Points(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.long))
+    assert not bool(f.nearest(nothing, camera, pose).isfinite().any())
 
 
 class Slabs:
@@ -144,7 +147,7 @@ def test_a_veil_before_the_camera_is_seen(part, veil: float, share: float) -> No
     frame = Frame(Path("none.png"), camera, "none.png", pose)
     u, v = torch.meshgrid(torch.linspace(-0.6, 0.6, 150), torch.linspace(-0.5, 0.5, 150), indexing="ij")
     wall = torch.stack([u, torch.full_like(u, 3.0), v], -1).reshape(-1, 3).double()
-    found = f.floaters_before(Slabs(veil), frame, wall)
+    found = f.floaters_before(Slabs(veil), frame, f.Points(wall, torch.arange(len(wall)) % 20))
     assert found.known == 1.0
     assert found.share == pytest.approx(share, abs=0.1)
     assert found.light == pytest.approx(veil / 2, abs=0.06)

@@ -11,7 +11,7 @@ import torch
 from record import Row
 from torch import Tensor
 
-from fields.floaters import Floaters, floaters_before, pooled, surfaces
+from fields.floaters import Floaters, Points, floaters_before, pooled, surfaces
 from fields.measures import band_energy, decibels, halves, lit, log_gains, mean_square
 from refield.field.radiance import Field
 from refield.field.render import render_camera
@@ -76,7 +76,7 @@ def judged(work: Path, longest: int) -> tuple[Row, list[View]]:
     return {"photos": len(capture.frames), "left out": len(views), "told by the fit": told} | figures(views), views
 
 
-def _view(field: Field, frame: Frame, points: Tensor, longest: int) -> View:
+def _view(field: Field, frame: Frame, points: Points, longest: int) -> View:
     camera = frame.camera.shrunk(min(1.0, longest / max(frame.camera.width, frame.camera.height)))
     photo = scaled_image(frame, camera)
     render = render_camera(field, camera, frame.world_from_cam).rgb.clamp(0, 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from record import Row, markdown
 
@@ -56,24 +56,21 @@ def curves_tables(rows: Sequence[Row]) -> str | None:
     times = [t for t in TIMES if t < until][-_MOST:]
     told = [look["psnr"] for row in known for look in row["looks"]]
     levels = [v for v in _LEVELS if min(told) < v <= max(told)][-_MOST:]
-    at = _table(known, {f"{t} s": (lambda r, t=t: psnr_at(r["looks"], t)) for t in times}, ends=True)
-    to = _table(known, {f"{v} dB": (lambda r, v=v: time_to(r["looks"], v)) for v in levels}, ends=False)
+    at = markdown([_line_of(row, {f"{t} s": psnr_at(row["looks"], t) for t in times}) | _end(row) for row in known])
+    to = markdown([_line_of(row, {f"{v} dB": time_to(row["looks"], v) for v in levels}) for row in known])
     return (
         "PSNR of left-out pixels (pooled, as rendered, dB) over seconds of training; between two looks, their line. "
         f"Seconds hold the looks.\n\n{at}\n\nSeconds to equal PSNR.\n\n{to}"
     )
 
 
-def _table(rows: Sequence[Row], columns: dict[str, Callable[[Row], float | None]], *, ends: bool) -> str:
-    out = []
-    for row in rows:
-        line: Row = {"capture": row["name"], "fit": row["how"]}
-        line |= {title: _fixed(of(row), 1) for title, of in columns.items()}
-        if ends:
-            last = row["looks"][-1]
-            line |= {"end": _fixed(last["psnr"], 1), "at, s": _fixed(last["seconds"], 0), "steps": last["step"]}
-        out.append(line)
-    return markdown(out)
+def _line_of(row: Row, values: dict[str, float | None]) -> Row:
+    return {"capture": row["name"], "fit": row["how"]} | {title: _fixed(v, 1) for title, v in values.items()}
+
+
+def _end(row: Row) -> Row:
+    last = row["looks"][-1]
+    return {"end": _fixed(last["psnr"], 1), "at, s": _fixed(last["seconds"], 0), "steps": last["step"]}
 
 
 def psnr_at(looks: Sequence[dict[str, float]], seconds: float) -> float | None:

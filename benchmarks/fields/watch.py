@@ -24,10 +24,10 @@ def watching() -> Iterator[Looks]:
     looks: Looks = []
     usual = TrainingLine.__call__
 
-    def heard(line: TrainingLine, look: Look) -> None:
+    def heard(self: TrainingLine, look: Look) -> None:
         if math.isfinite(look.psnr):
             looks.append({"step": look.step, "seconds": look.seconds, "psnr": look.psnr})
-        usual(line, look)
+        usual(self, look)
 
     TrainingLine.__call__ = heard  # type: ignore[method-assign]
     try:
