@@ -63,7 +63,7 @@ def rows_of(data: Path, asked: Asked) -> Iterator[Row]:
             data = folder / "work" / "capture"  # its poses are found once
     if asked.against is not None and seconds is not None:
         folder, limit = asked.out / name / asked.against, f"{seconds:.1f}"
-        options = ("--architecture", asked.against, "--nerfacto.max-seconds", limit, "--nerfacto.check-every", "25")
+        options = ("--architecture", asked.against, "--nerfacto.max-seconds", limit, "--nerfacto.check-every", "10")
         head = {"name": name, "how": f"{asked.against}, {seconds:.0f} s"}
         yield _fitted(head, data, folder, options, asked)
 

@@ -48,8 +48,8 @@ def _fixed(value: float | None, digits: int) -> str | None:
 
 
 def curves_tables(rows: Sequence[Row]) -> str | None:
-    """PSNR over time as the fits told it, those of a capture below each other; None if none told anything twice."""
-    known = [row for row in rows if len(row.get("looks", [])) > 1]
+    """PSNR over time as the fits told it, those of a capture below each other; None if none told anything."""
+    known = [row for row in rows if row.get("looks")]
     if not known:
         return None
     until = max(row["looks"][-1]["seconds"] for row in known)
