@@ -1,0 +1,1 @@
+"""How good a field of photographs is, by photos that were left out."""
