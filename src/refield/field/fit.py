@@ -42,6 +42,8 @@ class FitConfig:
     """weight of the distortion loss; without it fog fills the grid"""
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera (§10.1)"""
+    photos: PhotoModelConfig = field(default_factory=PhotoModelConfig)
+    """what is found out about the photos, beside the field"""
     field: HashFieldConfig = field(default_factory=HashFieldConfig)
     """shape of the field"""
     finest_auto: bool = True
@@ -52,8 +54,6 @@ class FitConfig:
     """looks without ``least_gain`` after which training stops"""
     least_gain: float = 0.02
     """dB"""
-    photos: PhotoModelConfig = field(default_factory=PhotoModelConfig)
-    """what is found out about the photos, beside the field"""
     seed: int = 0
     photo_memory: float | None = None
     """GB for the photos' pixels; of more than fit, a part is kept, drawn from every photo alike"""
@@ -97,6 +97,16 @@ _TRIES, _FIRST_STEP, _SECOND_STEP = 5, 100, 500
 _LATE = 0.3  # of its time; so late a fit does not begin anew
 _BY_HEART = 0.1
 
+
+@dataclass(frozen=True)
+class Fitted:
+    """A field, and what became known of the photos that it was fitted to."""
+
+    field: HashField
+    capture: Capture
+    """with the photos' exposures, poses and lenses as the fit found them, where it was to find them"""
+
+
 ProgressCallback = Callable[[FitProgress], None]
 StepCallback = Callable[[int, HashField], None]
 """Hears how many steps are done and the field as they left it, in training; it is not to change it."""
@@ -113,6 +123,19 @@ def fit_field(
     start: HashField | None = None,
     on_step: StepCallback | None = None,
 ) -> HashField:
+    """`fit_capture`'s field alone."""
+    return fit_capture(capture, config, on_progress, since=since, start=start, on_step=on_step).field
+
+
+def fit_capture(
+    capture: Capture,
+    config: FitConfig = FitConfig(),
+    on_progress: ProgressCallback | None = None,
+    *,
+    since: Since = UNCHANGED,
+    start: HashField | None = None,
+    on_step: StepCallback | None = None,
+) -> Fitted:
     """Fit a field to the capture's training frames.
 
     Args:
@@ -135,16 +158,19 @@ def fit_field(
         try:
             if config.device == "cuda":
                 _fit_on_gpu(model, photos, config, on_progress, on_step)
+                found = capture
             else:
                 may_give_up = start is None and attempt < _TRIES - 1
-                _Fit(model, photos, config, on_progress, on_step, began=began).run(may_give_up)
+                run = _Fit(model, photos, config, on_progress, on_step, began=began)
+                run.run(may_give_up)
+                found = run.photos.told(capture, run.judge, model)
             break
         except _StuckError:
             continue
         except NonFiniteError as error:
             error.field = model.eval().requires_grad_(False)
             raise
-    return model.eval().requires_grad_(False)
+    return Fitted(model.eval().requires_grad_(False), found)
 
 
 def _new_field(capture: Capture, config: FitConfig, seed: int) -> HashField:
@@ -271,7 +297,7 @@ class _Fit:
         began: float | None = None,
     ) -> None:
         self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
-        self.pixels, self.judge = photos.bank(), photos.judge()
+        self.pixels, self.judge = photos.bank(), photos.judge(config.photos.exposures)
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model)
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))

@@ -172,7 +172,7 @@ def check_decodes(path: Path) -> None:
 
 
 def frame_image(photo: Photo) -> Tensor:
-    """The pixels of a photo, uint8 (H, W, 3).
+    """The pixels of a photo, uint8 (H, W, 3); of neutral exposure, if its own is known.
 
     Raises:
         InputError: as `read_image`, or if the size is not the camera's.
@@ -184,7 +184,7 @@ def frame_image(photo: Photo) -> Tensor:
     if (width, height) != (photo.camera.width, photo.camera.height):
         expected = f"its camera says {photo.camera.width}x{photo.camera.height}"
         raise InputError(photo.path, f"has {width}x{height} pixels, {expected}", "correct w and h, or the image")
-    return image
+    return image if photo.exposure is None else photo.exposure.neutral(image, photo.camera)
 
 
 def scaled_image(photo: Photo, camera: Camera) -> Tensor:
