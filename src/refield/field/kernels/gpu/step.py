@@ -19,6 +19,7 @@ def train_step(
     field: tuple[Tensor, tuple[int, ...], Networks],
     aim: Aim,
     into: list[Tensor],
+    fine: Tensor | None = None,
     *,
     capacity: int | None = None,
 ) -> Stepped:
@@ -30,7 +31,7 @@ def train_step(
     tables, resolutions, networks = field
     origins, directions, _ = batch.rays
     net = (tables.detach(), resolutions, networks[0].detach(), networks[1][0].detach())
-    t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop, capacity=capacity)
+    t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop, fine, capacity=capacity)
     ids, mid = ray_ids(offsets, len(t0)), (t0 + t1) / 2
     d = directions[ids]
     unit = (contract(origins[ids] + d * mid[:, None], *space) + 2) / 4
