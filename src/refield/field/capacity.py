@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from refield.field.encoding import Contraction
-from refield.field.render import render_many
 from refield.field.radiance import Field
-from refield.scene.capture import Capture, Frame, camera_rays, Rays
+from refield.field.render import render_many
+from refield.scene.capture import Capture, Frame, Rays, camera_rays
 
 _PLACES = 20_000
 _MOST_PLACES_A_PHOTO = 500
