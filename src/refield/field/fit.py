@@ -17,6 +17,7 @@ from refield.field.encoding import Contraction, large_zeros
 from refield.field.kernels.reference import Aim
 from refield.field.occupancy import OccupancyTrainer
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
+from refield.field.photo_size import PhotoSizeConfig, as_read
 from refield.field.photos import UNCHANGED, Photos, Since
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.sampling import RESOLUTION, STOP, OccupancySampler
@@ -42,6 +43,10 @@ class FitConfig:
     """weight of the distortion loss; without it fog fills the grid"""
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera (§10.1)"""
+    photos: PhotoModelConfig = field(default_factory=PhotoModelConfig)
+    """what is found out about the photos, beside the field"""
+    size: PhotoSizeConfig = field(default_factory=PhotoSizeConfig)
+    """at which the photos are read"""
     field: HashFieldConfig = field(default_factory=HashFieldConfig)
     """shape of the field"""
     finest_auto: bool = True
@@ -52,8 +57,6 @@ class FitConfig:
     """looks without ``least_gain`` after which training stops"""
     least_gain: float = 0.02
     """dB"""
-    photos: PhotoModelConfig = field(default_factory=PhotoModelConfig)
-    """what is found out about the photos, beside the field"""
     seed: int = 0
     photo_memory: float | None = None
     """GB for the photos' pixels; of more than fit, a part is kept, drawn from every photo alike"""
@@ -127,6 +130,7 @@ def fit_field(
         InputError: a GPU is wanted and there is none.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row; it holds the last good state.
     """
+    capture, since = as_read(capture, since, config.size)
     began, photos = time.perf_counter(), Photos.of(capture, since, most_pixels(config))
     for attempt in range(_TRIES):
         seed = config.seed + attempt
