@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from refield.field.pixels import PixelBank
+from refield.scene.camera import Camera
 from refield.scene.capture import Frame
-from refield.scene.exposure import Exposure, vignetting_basis
+from refield.scene.exposure import Exposure
 
 _SHARE = 0.05  # of what a step says is missing is taken over, at the full rate
 _HOLD = 0.9  # of what is known of a parameter's curvature is kept from step to step
@@ -28,13 +29,13 @@ class ExposureFit:
     """
 
     def __init__(self, frames: Sequence[Frame]) -> None:
-        cameras = list(dict.fromkeys(f.camera for f in frames))
-        self.camera_of = torch.tensor([cameras.index(f.camera) for f in frames])
+        self._cameras = list(dict.fromkeys(f.camera for f in frames))
+        self.camera_of = torch.tensor([self._cameras.index(f.camera) for f in frames])
         """(F,)"""
         self.log_gains = torch.zeros(len(frames), 3)
-        self.vignetting = torch.zeros(len(cameras), 3)
+        self.vignetting = torch.zeros(len(self._cameras), 3)
         self._curvature = torch.zeros(len(frames), 3)
-        self._bend = torch.zeros(len(cameras), 3, 3)
+        self._bend = torch.zeros(len(self._cameras), 3, 3)
         self._shared = torch.bincount(self.camera_of) >= _SHARED
 
     def gains(self, owner: Tensor, basis: Tensor) -> Tensor:
@@ -65,12 +66,17 @@ class ExposureFit:
         change = torch.linalg.solve(self._bend + stiff * torch.eye(3), slope)
         self.vignetting -= _SHARE * rate * change * self._shared[:, None]
 
+    def of_camera(self, camera: Camera) -> tuple[float, float, float]:
+        """`Exposure.vignetting` of a camera; of one that took none of the photos, none."""
+        if camera not in self._cameras:
+            return 0.0, 0.0, 0.0
+        a, b, c = self.vignetting[self._cameras.index(camera)].tolist()
+        return a, b, c
+
     def found(self) -> tuple[Exposure, ...]:
         """Of each photo."""
-        return tuple(
-            Exposure(tuple(g.tolist()), tuple(self.vignetting[c].tolist()))  # type: ignore[arg-type]
-            for g, c in zip(self.log_gains.exp(), self.camera_of)
-        )
+        gains, fallen = self.log_gains.exp().tolist(), self.vignetting[self.camera_of].tolist()
+        return tuple(Exposure((r, g, b), (u, v, w)) for (r, g, b), (u, v, w) in zip(gains, fallen))
 
 
 def _remembered(before: Tensor, now: Tensor) -> Tensor:

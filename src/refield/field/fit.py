@@ -17,7 +17,7 @@ from refield.field.encoding import Contraction, large_zeros
 from refield.field.kernels.reference import Aim
 from refield.field.occupancy import OccupancyTrainer
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
-from refield.field.photo_size import PhotoSizeConfig, as_read
+from refield.field.photo_size import PhotoSizeConfig, as_read, at_full_size
 from refield.field.photos import UNCHANGED, Photos, Since
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.sampling import RESOLUTION, STOP, OccupancySampler
@@ -100,6 +100,16 @@ _TRIES, _FIRST_STEP, _SECOND_STEP = 5, 100, 500
 _LATE = 0.3  # of its time; so late a fit does not begin anew
 _BY_HEART = 0.1
 
+
+@dataclass(frozen=True)
+class Fitted:
+    """A field, and what became known of the photos that it was fitted to."""
+
+    field: HashField
+    capture: Capture
+    """with the photos' exposures, poses and lenses as the fit found them, where it was to find them"""
+
+
 ProgressCallback = Callable[[FitProgress], None]
 StepCallback = Callable[[int, HashField], None]
 """Hears how many steps are done and the field as they left it, in training; it is not to change it."""
@@ -116,6 +126,19 @@ def fit_field(
     start: HashField | None = None,
     on_step: StepCallback | None = None,
 ) -> HashField:
+    """`fit_capture`'s field alone."""
+    return fit_capture(capture, config, on_progress, since=since, start=start, on_step=on_step).field
+
+
+def fit_capture(
+    capture: Capture,
+    config: FitConfig = FitConfig(),
+    on_progress: ProgressCallback | None = None,
+    *,
+    since: Since = UNCHANGED,
+    start: HashField | None = None,
+    on_step: StepCallback | None = None,
+) -> Fitted:
     """Fit a field to the capture's training frames.
 
     Args:
@@ -139,16 +162,19 @@ def fit_field(
         try:
             if config.device == "cuda":
                 _fit_on_gpu(model, photos, config, on_progress, on_step)
+                found = capture
             else:
                 may_give_up = start is None and attempt < _TRIES - 1
-                _Fit(model, photos, config, on_progress, on_step, began=began).run(may_give_up)
+                run = _Fit(model, photos, config, on_progress, on_step, began=began)
+                run.run(may_give_up)
+                found = run.photos.told(capture, run.judge, model)
             break
         except _StuckError:
             continue
         except NonFiniteError as error:
             error.field = model.eval().requires_grad_(False)
             raise
-    return model.eval().requires_grad_(False)
+    return Fitted(model.eval().requires_grad_(False), at_full_size(found))
 
 
 def _new_field(capture: Capture, config: FitConfig, seed: int) -> HashField:
@@ -275,7 +301,7 @@ class _Fit:
         began: float | None = None,
     ) -> None:
         self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
-        self.pixels, self.judge = photos.bank(), photos.judge()
+        self.pixels, self.judge = photos.bank(), photos.judge(config.photos.exposures)
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model)
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))

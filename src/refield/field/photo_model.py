@@ -4,7 +4,7 @@ which parts of it show what no other photo does. All of it stands beside the fie
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -12,11 +12,13 @@ from torch import Tensor
 
 from refield.field.exposures import ExposureFit, basis_of
 from refield.field.kernels.reference import Batch, Stepped
+from refield.field.photos import HeldOut
 from refield.field.pixels import PixelBank
 from refield.field.poses import PoseFit
+from refield.field.radiance import Field
 from refield.field.sampling import OccupancySampler
 from refield.field.trust import PhotoTrust
-from refield.scene.capture import Frame, Rays
+from refield.scene.capture import Capture, Frame, Rays
 from refield.scene.exposure import Exposure
 
 _EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.02, 0.1, 0.1  # of a fit: what is asked of it must be there first
@@ -92,10 +94,21 @@ class PhotoModel:
             surface = torch.where(done.heaviest >= 0, done.cells[done.heaviest.clamp_min(0)], -1)
             self.trust.learn(asked.patches, surface, done.errors)
 
-    def frames(self) -> tuple[Frame, ...]:
-        """The training frames as the fit found them: poses, lenses."""
-        return self.bank.frames if self.poses is None else self.poses.found()
+    def told(self, capture: Capture, judge: HeldOut, field: Field) -> Capture:
+        """The capture with what was found: poses and lenses of its training frames, lenses of those that were held
+        out, exposures of both."""
+        found = {f.name: f for f in self._training()}
+        lenses = {old.camera: found[old.name].camera for old in self.bank.frames}
+        gains = judge.gains(field).tolist() if self.exposures is not None else []
+        left_out = {}
+        for i, frame in enumerate(capture.held_out):
+            vignetting = (0.0, 0.0, 0.0) if self.exposures is None else self.exposures.of_camera(frame.camera)
+            exposure = Exposure(tuple(gains[i]), vignetting).on(frame.exposure) if i < len(gains) else frame.exposure
+            left_out[frame.name] = replace(frame, camera=lenses.get(frame.camera, frame.camera), exposure=exposure)
+        return replace(capture, frames=tuple(found.get(f.name) or left_out[f.name] for f in capture.frames))
 
-    def found_exposures(self) -> tuple[Exposure, ...] | None:
-        """Of each training frame; None if none were asked for."""
-        return None if self.exposures is None else self.exposures.found()
+    def _training(self) -> tuple[Frame, ...]:
+        frames = self.bank.frames if self.poses is None else self.poses.found()
+        if self.exposures is None:
+            return frames
+        return tuple(replace(f, exposure=e.on(f.exposure)) for f, e in zip(frames, self.exposures.found()))

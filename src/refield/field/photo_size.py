@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from refield.field.photos import UNCHANGED, Since
+from refield.field.photos import Since
 from refield.scene.capture import Capture, Frame
 from refield.scene.errors import InputError
 
@@ -65,6 +65,11 @@ def as_read(capture: Capture, since: Since, config: PhotoSizeConfig) -> tuple[Ca
     old, new = smaller[: len(capture.frames)], smaller[len(capture.frames) :]
     valid = {f.name: _shrunk(since.valid[f.name], f) for f in old if f.name in since.valid}
     return replace(capture, frames=old), Since(new, valid)
+
+
+def at_full_size(capture: Capture) -> Capture:
+    """The capture with its photos at the size of their files, whatever became known of their cameras."""
+    return replace(capture, frames=tuple(f.whole() for f in capture.frames))
 
 
 def _shrunk(mask: Tensor, frame: Frame) -> Tensor:

@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from refield.field.kernels.reference import BURNT
 from refield.field.pixels import PixelBank
-from refield.field.radiance import HashField
+from refield.field.radiance import Field
 from refield.field.render import render_many
 from refield.scene.capture import Capture, Frame, Rays
 
@@ -56,18 +57,23 @@ class Photos:
         """The pixels that teach."""
         return PixelBank(self.train, most=self.most, masks=self.taught)
 
-    def judge(self) -> HeldOut:
-        """The pixels that do not."""
-        return HeldOut(self.held_out, masks=self.judged)
+    def judge(self, exposed: bool = False) -> HeldOut:
+        """The pixels that do not; see `HeldOut`."""
+        return HeldOut(self.held_out, masks=self.judged, exposed=exposed)
 
 
 class HeldOut:
     """Fixed pixels of photos that training never sees."""
 
     def __init__(
-        self, frames: tuple[Frame, ...], count: int = 16384, masks: Sequence[Tensor | None] | None = None
+        self,
+        frames: tuple[Frame, ...],
+        count: int = 16384,
+        masks: Sequence[Tensor | None] | None = None,
+        exposed: bool = False,
     ) -> None:
-        """``masks``: see `PixelBank`."""
+        """``masks``: see `PixelBank`. ``exposed``: the photos' exposures are not known: each one's is found by the
+        pixels of its left half, and those of its right half judge."""
         self.rays: Rays | None = None
         if not frames:
             return
@@ -75,11 +81,37 @@ class HeldOut:
         if len(bank):
             chosen = torch.arange(len(bank))
             self.rays, self.truth = bank.rays(chosen), bank.colours(chosen)
+            self.owner, self.photos = bank.frame_of(chosen), len(frames)
+            width = torch.tensor([f.camera.width for f in frames])[self.owner]
+            left = bank.place_of(chosen) % width < width // 2
+            self.asked = left if exposed else None
+            """(P,) bool: pixels that tell the exposures; None if they are known"""
 
-    def psnr(self, model: HashField) -> float:
+    def psnr(self, model: Field) -> float:
         """dB over the pixels; NaN if there are none."""
         if self.rays is None:
             return math.nan
-        model.eval()
-        rgb = render_many(model, self.rays).rgb.clamp(0, 1)
-        return -10 * math.log10(max(float((rgb - self.truth).square().mean()), 1e-12))
+        rgb, truth = self._shown(model), self.truth
+        if self.asked is not None:
+            rgb, truth = (rgb * self._gains(rgb, self.asked)[self.owner]).clamp(0, 1)[~self.asked], truth[~self.asked]
+        return -10 * math.log10(max(float((rgb - truth).square().mean()), 1e-12))
+
+    def gains(self, model: Field) -> Tensor:
+        """How each photo is exposed, by all of its pixels here, (F, 3); see `Exposure.gains`."""
+        if self.rays is None:
+            return torch.ones(0, 3)
+        rgb = self._shown(model)
+        return self._gains(rgb, torch.ones(len(rgb), dtype=torch.bool))
+
+    def _shown(self, model: Field) -> Tensor:
+        if isinstance(model, nn.Module):
+            model.eval()
+        assert self.rays is not None
+        return render_many(model, self.rays).rgb.clamp(0, 1).to(self.truth.device)
+
+    def _gains(self, rgb: Tensor, asked: Tensor) -> Tensor:
+        """By least squares over pixels that are asked and not burnt out, (F, 3); 1 where there are none."""
+        used = asked[:, None] & (self.truth < BURNT)
+        both = torch.stack([rgb * self.truth, rgb * rgb]) * used
+        above, below = torch.zeros(2, self.photos, 3, device=rgb.device).index_add_(1, self.owner, both)
+        return torch.where(below > 1e-6, above / below.clamp_min(1e-6), 1.0)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from refield.scene.camera import Camera
+from refield.scene.exposure import Exposure
 
 
 class Made(Protocol):
@@ -46,6 +47,8 @@ class Photo:
     """How the file calls it (the ``file_path`` of a transforms.json); unique within a capture."""
     made: Made | None = field(default=None, kw_only=True, repr=False, compare=False)
     """Writes the file when its pixels are first asked for; None for a file that is there."""
+    exposure: Exposure | None = field(default=None, kw_only=True)
+    """How it was exposed, if that is known: its pixels are then read as those of a photo of neutral exposure."""
     file_size: tuple[int, int] | None = field(default=None, kw_only=True)
     """Width and height of the file, where ``camera`` takes a smaller picture; None: the camera's."""
 

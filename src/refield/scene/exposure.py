@@ -2,8 +2,8 @@
 
     photo = neutral colour * gain of the photo and channel * vignetting of the camera
 
-in coded (sRGB) values, in which more light is a factor, but for the last tenth above black; what comes out brighter than
-white is white. The physical part of PPISP, without its colour matrix and its response curve, which a single camera
+in coded (sRGB) values, in which more light is a factor, but for the last tenth above black; what comes out brighter
+than white is white. The physical part of PPISP, without its colour matrix and its response curve, which a single camera
 cannot tell from the scene's own colours.
 """
 
@@ -30,6 +30,14 @@ class Exposure:
     def stops(self) -> float:
         """How much lighter than neutral the photo is, in stops."""
         return 2.2 * sum(float(torch.tensor(g).log2()) for g in self.gains) / 3  # sRGB's gamma, roughly
+
+    def on(self, earlier: Exposure | None) -> Exposure:
+        """Both together: this one of a photo that was read as neutral by an ``earlier`` one."""
+        if earlier is None:
+            return self
+        r, g, b = (x * y for x, y in zip(self.gains, earlier.gains))
+        v, w, u = (x + y for x, y in zip(self.vignetting, earlier.vignetting))
+        return Exposure((r, g, b), (v, w, u))
 
     def factor(self, camera: Camera) -> Tensor:
         """By how much the photo differs from neutral at every pixel, (H, W, 3) float32."""

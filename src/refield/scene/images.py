@@ -172,7 +172,8 @@ def check_decodes(path: Path) -> None:
 
 
 def frame_image(photo: Photo) -> Tensor:
-    """The pixels of a photo at its camera's size, uint8 (H, W, 3); those of a larger file are averaged.
+    """The pixels of a photo at its camera's size, uint8 (H, W, 3); those of a larger file are averaged. They are as of
+    neutral exposure, if the photo's own is known.
 
     Raises:
         InputError: as `read_image`, or if the file's size is not what is known of it.
@@ -186,9 +187,10 @@ def frame_image(photo: Photo) -> Tensor:
     if (width, height) != (wide, high):
         expected = f"its camera says {wide}x{high}"
         raise InputError(photo.path, f"has {width}x{height} pixels, {expected}", "correct w and h, or the image")
-    if photo.file_size is None:
-        return image
-    return torch.from_numpy(cv2.resize(image.numpy(), (camera.width, camera.height), interpolation=cv2.INTER_AREA))
+    if photo.file_size is not None:
+        small = cv2.resize(image.numpy(), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        image = torch.from_numpy(small)
+    return image if photo.exposure is None else photo.exposure.neutral(image, camera)
 
 
 def scaled_image(photo: Photo, camera: Camera) -> Tensor:

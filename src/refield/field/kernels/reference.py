@@ -394,7 +394,7 @@ def train_step(
 
 
 def heaviest(w: Tensor, offsets: Tensor) -> Tensor:
-    """The sample of each ray with the greatest weight (S,), the first of several; (N,) int64, -1 where there is none."""
+    """The sample of each ray with the greatest weight (S,), the first of several; (N,) int64, -1 without any."""
     ids = _ray_ids(offsets)
     most = w.new_zeros(len(offsets) - 1).scatter_reduce_(0, ids, w[: len(ids)], "amax")
     found = torch.full((len(offsets) - 1,), -1, dtype=torch.long, device=w.device)
