@@ -1,6 +1,6 @@
 """The folder in which a field lives: capture, field, visits. Every artefact's place, each put there whole.
 
-    WORK/  refield.json   capture/{transforms.json,images/,world.json,landmarks.safetensors}
+    WORK/  refield.json   capture/{transforms.json,refined.json,images/,world.json,landmarks.safetensors}
            field/{field.safetensors,field.json}
            visits/001/{change.json, grid_0.npz, masks/, photos/, field.safetensors, report.json, report.html}
 
@@ -36,6 +36,8 @@ from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.change_files import load_change, save_change
 from refield.scene.errors import InputError
 from refield.scene.files import read_json, write_json
+from refield.scene.refined import NAME as REFINED
+from refield.scene.refined import refined, write_refined
 from refield.scene.transforms_json import load_transforms, save_transforms
 from refield.scene.world import World, world_of
 
@@ -196,8 +198,13 @@ class Workspace:
         return copied
 
     def capture(self) -> Capture:
-        """The photos that the field was fitted to."""
-        return load_transforms(self.path / "capture", decode=False)
+        """The photos that the field was fitted to, with what the fit found out about them."""
+        given = load_transforms(self.path / "capture", decode=False)
+        return refined(given, self.path / "capture" / REFINED)
+
+    def keep_refined(self, given: Capture, found: Capture) -> None:
+        """Note what the fit found out about the photos of the capture kept here, see `refield.scene.refined`."""
+        write_refined(self.path / "capture" / REFINED, given, found)
 
     def keep_field(self, field: HashField | NerfactoField, psnr: float = math.nan) -> None:
         """Write the fitted field and, if known, its PSNR on held-out pixels (dB)."""

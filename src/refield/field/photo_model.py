@@ -21,7 +21,7 @@ from refield.field.trust import PhotoTrust
 from refield.scene.capture import Capture, Frame, Rays
 from refield.scene.exposure import Exposure
 
-_EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.02, 0.1, 0.1  # of a fit: what is asked of it must be there first
+_EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.02, 0.25, 0.1  # of a fit: what is asked of it must be there first
 _MOVING = 4  # every so-many-th ray tells how poses are wrong
 
 

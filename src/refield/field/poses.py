@@ -17,7 +17,7 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays
 from refield.scene.pose import exp
 
-_SPEED = 0.03  # of a pixel that a parameter moves things in the photo in one step at the full rate
+_SPEED = 0.004  # of a pixel that a parameter moves things in the photo in one step at the full rate
 _FAR = 8.0  # pixels: poses from structure from motion are not further off; a photo that wants more is not followed
 _SHARED = 3  # photos of one camera from which its lens can be told from their poses
 
