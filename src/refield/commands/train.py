@@ -13,6 +13,7 @@ from refield.field.fit import FitConfig, NonFiniteError, ProgressCallback, fit_f
 from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig, fit_nerfacto
 from refield.field.memory import Memory, memory_fault, memory_of
 from refield.field.nerfacto import NerfactoField
+from refield.field.photo_size import sizes_told
 from refield.field.radiance import HashField
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
 from refield.photos.landmarks import Landmarks, write_landmarks
@@ -91,7 +92,10 @@ def train(
         if landmarks is not None:
             write_landmarks(workspace.landmarks, landmarks)
         clock.stage(f"fit a field to {len(capture.train)} photos")
-        clock.console.print(f"           memory: {needed}", markup=False)
+        sizes = sizes_told(capture, config.size) if isinstance(config, FitConfig) else None
+        for told in (sizes, f"memory: {needed}"):
+            if told is not None:
+                clock.console.print(f"           {told}", markup=False)
         try:
             with clock.training("fit") as line:
                 fitted = _fitted(capture, config, line)

@@ -17,6 +17,7 @@ from refield.field.encoding import Contraction, large_zeros
 from refield.field.kernels.reference import Aim
 from refield.field.occupancy import OccupancyTrainer
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
+from refield.field.photo_size import PhotoSizeConfig, as_read, at_full_size
 from refield.field.photos import UNCHANGED, Photos, Since
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.sampling import RESOLUTION, STOP, OccupancySampler
@@ -44,6 +45,8 @@ class FitConfig:
     """gradient scaling reaches 1 at this many core radii from the camera (§10.1)"""
     photos: PhotoModelConfig = field(default_factory=PhotoModelConfig)
     """what is found out about the photos, beside the field"""
+    size: PhotoSizeConfig = field(default_factory=PhotoSizeConfig)
+    """at which the photos are read"""
     field: HashFieldConfig = field(default_factory=HashFieldConfig)
     """shape of the field"""
     finest_auto: bool = True
@@ -150,6 +153,7 @@ def fit_capture(
         InputError: a GPU is wanted and there is none.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row; it holds the last good state.
     """
+    capture, since = as_read(capture, since, config.size)
     began, photos = time.perf_counter(), Photos.of(capture, since, most_pixels(config))
     for attempt in range(_TRIES):
         seed = config.seed + attempt
@@ -170,7 +174,7 @@ def fit_capture(
         except NonFiniteError as error:
             error.field = model.eval().requires_grad_(False)
             raise
-    return Fitted(model.eval().requires_grad_(False), found)
+    return Fitted(model.eval().requires_grad_(False), at_full_size(found))
 
 
 def _new_field(capture: Capture, config: FitConfig, seed: int) -> HashField:
