@@ -137,6 +137,7 @@ def fit_capture(
     *,
     since: Since = UNCHANGED,
     start: HashField | None = None,
+    goes_on: bool = False,
     on_step: StepCallback | None = None,
 ) -> Fitted:
     """Fit a field to the capture's training frames.
@@ -165,7 +166,7 @@ def fit_capture(
                 found = capture
             else:
                 may_give_up = start is None and attempt < _TRIES - 1
-                run = _Fit(model, photos, config, on_progress, on_step, began=began)
+                run = _Fit(model, photos, config, on_progress, on_step, began=began, goes_on=goes_on)
                 run.run(may_give_up)
                 found = run.photos.told(capture, run.judge, model)
             break
@@ -299,9 +300,11 @@ class _Fit:
         on_progress: ProgressCallback | None,
         on_step: StepCallback | None,
         began: float | None = None,
+        goes_on: bool = False,
     ) -> None:
+        self.goes_on = goes_on
         self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
-        self.pixels, self.judge = photos.bank(), photos.judge(config.photos.exposures)
+        self.pixels, self.judge = photos.bank(), photos.judge()
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model)
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))
@@ -349,7 +352,7 @@ class _Fit:
         out."""
         if self.steps_done not in (_FIRST_STEP, _SECOND_STEP):
             return False
-        now = -10 * math.log10(max(self.loss, 1e-12)), self.judge.psnr(self.model)
+        now = -10 * math.log10(max(self.loss, 1e-12)), self.judge.psnr(self.model, self.photos.exposing)
         self.model.train()
         if self.steps_done == _FIRST_STEP or self.first is None:
             self.first = now
@@ -358,6 +361,9 @@ class _Fit:
         return taught > 0 and left_out < _BY_HEART * taught
 
     def _step(self, step: int, progress: float) -> None:
+        if self.photos.may_expose(progress):
+            self.photos.exposing = self.judge.tells_exposures(self.model)
+            self.model.train()
         n = self.rays_per_step
         asked = self.photos.ask(torch.randint(len(self.pixels), (n,)), progress)
         model, sampler = self.model, self.model.sampler
@@ -366,7 +372,7 @@ class _Fit:
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
         where = (space, sampler.grid, sampler.lattice)
         done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, sampler.fine)
-        rate = rate_factor(progress)
+        rate = rate_factor((1 + progress) / 2 if self.goes_on else progress)
         if self.adam.step(self.config.rate * rate, done.loss):
             self.loss = done.loss if math.isnan(self.loss) else self.loss + 0.03 * (done.loss - self.loss)
             self.occupancy.observe(step, done.cells, done.weights, done.sigmas, done.parts)
@@ -391,7 +397,7 @@ class _Fit:
         self.model.sampler = replace(self.model.sampler, step=self.finest_step * to)
 
     def _look(self, step: int) -> float:
-        psnr = self.judge.psnr(self.model)
+        psnr = self.judge.psnr(self.model, self.photos.exposing)
         self.model.train()
         if self.on_progress:
             seconds = time.perf_counter() - self.began

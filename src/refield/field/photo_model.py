@@ -21,7 +21,7 @@ from refield.field.trust import PhotoTrust
 from refield.scene.capture import Capture, Frame, Rays
 from refield.scene.exposure import Exposure
 
-_EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.02, 0.25, 0.1  # of a fit: what is asked of it must be there first
+_EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.1, 0.25, 0.1  # of a fit: what is asked of it must be there first
 _MOVING = 4  # every so-many-th ray tells how poses are wrong
 
 
@@ -56,8 +56,18 @@ class PhotoModel:
         frames = bank.frames
         distance = torch.stack([f.centre.float() - sampler.contraction.centre for f in frames]).norm(dim=-1).median()
         self.exposures = ExposureFit(frames) if config.exposures else None
+        self.exposing = False
+        """whether they are heeded; set by the fit, which knows photos that are left out"""
+        self._asked_whether = False
         self.poses = PoseFit(frames, float(distance)) if config.poses else None
         self.trust = PhotoTrust(bank, sampler.resolution**3) if config.trust else None
+
+    def may_expose(self, progress: float) -> bool:
+        """Whether now, once in a fit, is to be found out if the photos' exposures differ at all: gains of photos that
+        were exposed alike would take up what the field does not show yet."""
+        now = self.exposures is not None and not self._asked_whether and progress >= _EXPOSED_FROM
+        self._asked_whether |= now
+        return now
 
     def ask(self, pixels: Tensor, progress: float) -> Asked:
         """Rays of pixels (N,) as they stand, with the photos' gains and trust; ``progress`` of the fit in [0, 1]."""
@@ -68,7 +78,7 @@ class PhotoModel:
         else:
             rays = self.poses.rays(owner, bank.camera_directions(pixels, owner))
         gains = basis = patches = trust = None
-        if self.exposures is not None:
+        if self.exposures is not None and self.exposing:
             basis = basis_of(bank, pixels, owner)
             gains = self.exposures.gains(owner, basis)
         if self.trust is not None and progress >= _TRUSTED_FROM:
@@ -83,7 +93,7 @@ class PhotoModel:
     def learn(self, asked: Asked, done: Stepped, progress: float, rate: float) -> None:
         """Take in what a step found; ``rate`` in [0, 1] falls as the fit's."""
         batch, owner = asked.batch, asked.owner
-        if self.exposures is not None and asked.basis is not None and progress >= _EXPOSED_FROM:
+        if self.exposures is not None and asked.basis is not None:
             assert batch.gains is not None and done.shown is not None and done.errors is not None
             weight = 1.0 if batch.trust is None else batch.trust[:, None]
             self.exposures.learn(owner, asked.basis, batch.gains * done.shown, weight * done.errors, rate)
@@ -99,7 +109,7 @@ class PhotoModel:
         out, exposures of both."""
         found = {f.name: f for f in self._training()}
         lenses = {old.camera: found[old.name].camera for old in self.bank.frames}
-        gains = judge.gains(field).tolist() if self.exposures is not None else []
+        gains = judge.gains(field).tolist() if self.exposing else []
         left_out = {}
         for i, frame in enumerate(capture.held_out):
             vignetting = (0.0, 0.0, 0.0) if self.exposures is None else self.exposures.of_camera(frame.camera)
@@ -109,6 +119,6 @@ class PhotoModel:
 
     def _training(self) -> tuple[Frame, ...]:
         frames = self.bank.frames if self.poses is None else self.poses.found()
-        if self.exposures is None:
+        if self.exposures is None or not self.exposing:
             return frames
         return tuple(replace(f, exposure=e.on(f.exposure)) for f, e in zip(frames, self.exposures.found()))

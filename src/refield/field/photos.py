@@ -57,9 +57,9 @@ class Photos:
         """The pixels that teach."""
         return PixelBank(self.train, most=self.most, masks=self.taught)
 
-    def judge(self, exposed: bool = False) -> HeldOut:
-        """The pixels that do not; see `HeldOut`."""
-        return HeldOut(self.held_out, masks=self.judged, exposed=exposed)
+    def judge(self) -> HeldOut:
+        """The pixels that do not."""
+        return HeldOut(self.held_out, masks=self.judged)
 
 
 class HeldOut:
@@ -70,10 +70,8 @@ class HeldOut:
         frames: tuple[Frame, ...],
         count: int = 16384,
         masks: Sequence[Tensor | None] | None = None,
-        exposed: bool = False,
     ) -> None:
-        """``masks``: see `PixelBank`. ``exposed``: the photos' exposures are not known: each one's is found by the
-        pixels of its left half, and those of its right half judge."""
+        """``masks``: see `PixelBank`."""
         self.rays: Rays | None = None
         if not frames:
             return
@@ -83,18 +81,30 @@ class HeldOut:
             self.rays, self.truth = bank.rays(chosen), bank.colours(chosen)
             self.owner, self.photos = bank.frame_of(chosen), len(frames)
             width = torch.tensor([f.camera.width for f in frames])[self.owner]
-            left = bank.place_of(chosen) % width < width // 2
-            self.asked = left if exposed else None
-            """(P,) bool: pixels that tell the exposures; None if they are known"""
+            self.left: Tensor = bank.place_of(chosen) % width < width // 2
+            """(P,) bool: pixels of the left halves of photos"""
 
-    def psnr(self, model: Field) -> float:
-        """dB over the pixels; NaN if there are none."""
+    def psnr(self, model: Field, exposed: bool = False) -> float:
+        """dB over the pixels; NaN if there are none. ``exposed``: the photos' exposures are not known: each one's is
+        found by the pixels of its left half, and those of its right half judge."""
         if self.rays is None:
             return math.nan
-        rgb, truth = self._shown(model), self.truth
-        if self.asked is not None:
-            rgb, truth = (rgb * self._gains(rgb, self.asked)[self.owner]).clamp(0, 1)[~self.asked], truth[~self.asked]
-        return -10 * math.log10(max(float((rgb - truth).square().mean()), 1e-12))
+        rgb = self._shown(model)
+        return self._psnr_of(self._exposed(rgb), ~self.left) if exposed else self._psnr_of(rgb, None)
+
+    def tells_exposures(self, model: Field) -> bool:
+        """Whether the photos' right halves come out better for exposures that their left halves tell."""
+        if self.rays is None:
+            return False
+        rgb, right = self._shown(model), ~self.left
+        return self._psnr_of(self._exposed(rgb), right) > self._psnr_of(rgb, right)
+
+    def _exposed(self, rgb: Tensor) -> Tensor:
+        return (rgb * self._gains(rgb, self.left)[self.owner]).clamp(0, 1)
+
+    def _psnr_of(self, rgb: Tensor, of: Tensor | None) -> float:
+        off = (rgb - self.truth).square()
+        return -10 * math.log10(max(float((off if of is None else off[of]).mean()), 1e-12))
 
     def gains(self, model: Field) -> Tensor:
         """How each photo is exposed, by all of its pixels here, (F, 3); see `Exposure.gains`."""
