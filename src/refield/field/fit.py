@@ -364,11 +364,12 @@ class _Fit:
         space = (sampler.contraction.centre, sampler.contraction.radius)
         aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
-        done = kernels.train_step(asked.batch, space, sampler.grid, sampler.lattice, field, aim, self.adam.grads)
+        where = (space, sampler.grid, sampler.lattice)
+        done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, sampler.fine)
         rate = rate_factor(progress)
         if self.adam.step(self.config.rate * rate, done.loss):
             self.loss = done.loss if math.isnan(self.loss) else self.loss + 0.03 * (done.loss - self.loss)
-            self.occupancy.observe(step, done.cells, done.weights, done.sigmas)
+            self.occupancy.observe(step, done.cells, done.weights, done.sigmas, done.parts)
             self.photos.learn(asked, done, progress, rate)
         self._resize(n, len(done.weights))
 

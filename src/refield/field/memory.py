@@ -50,7 +50,7 @@ def memory_of(capture: Capture, config: FitConfig | NerfactoFitConfig) -> Memory
     shape = config.field
     tables = shape.levels * (1 << shape.log2_table) * 8
     a_step = config.samples if isinstance(config, FitConfig) else 3 * config.rays * config.field.samples
-    cells = RESOLUTION**3 * (16 + 1 + 1 + 8)
+    cells = RESOLUTION**3 * (16 + 1 + 1 + 8 + 8 + 5 * 8 + 4)  # the latter of their parts
     sample = 3 * 8 * shape.levels + 40
     work = CHUNK * _ROOM * (8 * shape.levels + 28) + 2 * a_step * sample
     return Memory(photos, distinct if distinct <= DIRECTIONS_MOST else 0, 4 * tables + cells, work)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.encoding import large_zeros
+from refield.field.parts import Parts
 from refield.field.pixels import PixelBank
 from refield.field.radiance import HashField
 from refield.field.render import CHUNK
@@ -45,6 +46,9 @@ class OccupancyTrainer:
         self.rounds = 1  # renewals of the grid, from 1
         self.open = self.allowed.nonzero()[:, 0]
         self.sharp = False
+        self.parts: Parts | None = None
+        """of cells; from the first step on that says in which its samples were"""
+        self._opacity = _OPACITY  # the least that is kept
         self.among_cameras = torch.zeros(cells, dtype=torch.bool, device=device)
         self.state = large_zeros(cells, 4).to(device)
         """see `kernels.reference.observe`"""
@@ -61,9 +65,14 @@ class OccupancyTrainer:
         """(R**3,) the most that some ray gave each cell of late."""
         return self.state[:, 1]
 
-    def observe(self, step: int, cells: Tensor, w: Tensor, sigmas: Tensor) -> None:
-        """After each step: samples' cells (S,), weights (S,), densities (S,). Renews the grid every 16 or 32 steps."""
+    def observe(self, step: int, cells: Tensor, w: Tensor, sigmas: Tensor, parts: Tensor | None = None) -> None:
+        """After each step: samples' cells (S,), weights (S,), densities (S,), and in which part of its cell each was.
+        Renews the grid every 16 or 32 steps."""
         kernels.observe(self.state, self.rounds, DECAY, cells, w, sigmas)
+        if parts is not None and self.sharp:
+            self.parts = self.parts or Parts(self.model)
+            self.parts.observe(cells, parts, self.parts.opacity(cells, sigmas) > self._opacity)
+            self.parts.probe(cells, self._opacity)
         every = EVERY if step < _OFTEN_UNTIL else 2 * EVERY
         if step % every == every - 1:
             self.renew(step)
@@ -80,8 +89,11 @@ class OccupancyTrainer:
             # a few hidden cells get another chance, since geometry still changes
             again = self.open[torch.randint(len(self.open), (len(self.open) // 100,), device=self.open.device)]
             self.state[again, 1] = self.state[again, 1].clamp_min(4 * _WEIGHT)
+            if self.parts is not None:  # as those that are probed
+                self.parts.forget(cells)
         self.sharp = step >= 4 * self.cull_from
-        self._set(_WEIGHT if step >= self.cull_from else -1.0, self.sharp)
+        grid = self._kept(_WEIGHT if step >= self.cull_from else -1.0, self.sharp)
+        self.model.looking_where(*((grid,) if self.parts is None else self.parts.narrowed(grid)))
         self.rounds += 1
 
     def _probe(self, cells: Tensor) -> Tensor:
@@ -93,17 +105,19 @@ class OccupancyTrainer:
             sigma = model.sigma(kernels.hash_density(unit, model.density_net))
         return -torch.expm1(-sigma * self.state[cells, 2])
 
-    def _set(self, weight: float, only_seen: bool) -> None:
-        """Show cells that are opaque enough and have a weight above ``weight``."""
-        opacity = min(_OPACITY, float(self.state[:, 0].mean()))
+    def _kept(self, weight: float, only_seen: bool) -> Tensor:
+        """The cells that are opaque enough and have a weight above ``weight``, (R, R, R) uint8."""
+        self._opacity = min(_OPACITY, float(self.state[:, 0].mean()))
         allowed = self.allowed
         if self.sharp:
             allowed = allowed & ~(self.among_cameras & (self.state[:, 0] < _HAZE))
-        grid = kernels.keep(self.state, allowed, opacity, weight, only_seen)
-        self.model.looking_where(grid.reshape(self.model.sampler.grid.shape))
+        grid = kernels.keep(self.state, allowed, self._opacity, weight, only_seen)
+        return grid.reshape(self.model.sampler.grid.shape)
 
     def settle(self, pixels: PixelBank, rays: int = 200_000) -> None:
-        """The final grid: every opaque cell that some training ray sees. Leaves the model in training mode.
+        """The final grid and masks: every opaque cell that some training ray sees, and its opaque parts.
+
+        Leaves the model in training mode.
 
         Where no ray ever went the density is whatever the networks make of it: haze before a new camera.
         """
@@ -111,13 +125,19 @@ class OccupancyTrainer:
         for _ in range(2):
             for cells in opaque.split(1 << 18):
                 self.state[cells, 0] = torch.maximum(self.state[cells, 0], self._probe(cells))
-        self._set(-1.0, False)
+        self.model.looking_where(self._kept(-1.0, False))
+        parts = self.parts or Parts(self.model)
+        parts.forget_all()
+        samples = torch.zeros_like(self.state[:, 0])
         self.state[:, 1] = torch.where(self.state[:, 3] >= 0, self.state[:, 1], 0)
         for chosen in torch.randint(len(pixels), (rays,)).split(CHUNK):
             r = pixels.rays(chosen)
             with torch.no_grad():
-                samples = self.model.samples(r, jitter=True)
-                x, _ = samples.positions(r)
-                w = weights(self.model.density(x), samples)
-            kernels.scatter_max(w, self.model.sampler.cells(x), self.state[:, 1])
-        self._set(_WEIGHT / 2, False)
+                found = self.model.samples(r, jitter=True)
+                x, _ = found.positions(r)
+                w = weights(self.model.density(x), found)
+            cells, part = self.model.sampler.places(x)
+            kernels.scatter_max(w, cells, self.state[:, 1])
+            parts.observe(cells, part, w > _WEIGHT / 2)
+            samples.index_add_(0, cells, torch.ones_like(w))
+        self.model.looking_where(*parts.settled(self._kept(_WEIGHT / 2, False), self._opacity, samples))

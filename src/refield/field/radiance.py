@@ -150,6 +150,6 @@ class HashField(nn.Module):
         """Inverse of :meth:`save`. Raises InputError naming the file that is missing or not ours."""
         return read_field(folder, "HashField", HashField.from_state)
 
-    def looking_where(self, grid: Tensor) -> None:
-        """Replace the occupancy grid (R, R, R) uint8."""
-        self.sampler = replace(self.sampler, grid=grid)
+    def looking_where(self, grid: Tensor, fine: Tensor | None = None) -> None:
+        """Replace the occupancy grid (R, R, R) uint8, and what is known of its cells' parts (R, R, R) int64."""
+        self.sampler = replace(self.sampler, grid=grid, fine=fine)

@@ -19,8 +19,11 @@ from refield.field.kernels.gpu.networks import hash_density, hash_field
 from refield.field.kernels.gpu.optimiser import adam, adam_scale, descend, observe, scatter_max
 from refield.field.kernels.gpu.rays import accumulate, contract, distortion, ray_ids, spherical_harmonics, weights
 from refield.field.kernels.gpu.step import train_step
-from refield.field.kernels.reference import (  # torch's own kernels do the one; nobody trains a helper on a GPU yet
+from refield.field.kernels.reference import (  # torch's own kernels do for those; nobody trains a helper on a GPU yet
     keep,
+    narrow,
+    note,
+    spread,
     woven_step,
 )
 
@@ -37,10 +40,13 @@ __all__ = [
     "keep",
     "march",
     "march_visible",
+    "narrow",
+    "note",
     "observe",
     "ray_ids",
     "scatter_max",
     "spherical_harmonics",
+    "spread",
     "train_step",
     "weights",
     "woven_step",
