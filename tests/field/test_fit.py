@@ -222,8 +222,8 @@ def broken(monkeypatch: pytest.MonkeyPatch, bad: Callable[[int], bool], gradient
     """Make the loss, or one of its gradients, NaN in chosen steps; the list holds the steps taken."""
     whole, steps = kernels.train_step, []
 
-    def step(*args):  # type: ignore[no-untyped-def]
-        done = whole(*args)
+    def step(*args, **more):  # type: ignore[no-untyped-def]
+        done = whole(*args, **more)
         steps.append(len(steps))
         if not bad(steps[-1]):
             return done

@@ -230,6 +230,21 @@ def test_train_step(fill: float, scale: float, rays: int) -> None:
         assert mine.shape == (rays // 2, 3) and off.float().mean() < 0.03
 
 
+@pytest.mark.parametrize("fill, rays", [(0.05, 700), (1.0, 257), (0.0, 20), (0.3, 0)])
+def test_render(fill: float, rays: int) -> None:
+    torch.manual_seed(8)
+    nets, tables = networks(4, 16, 7), torch.randn(4, 1 << 12, 2)
+    origins = torch.nn.functional.normalize(torch.randn(rays, 3), dim=-1) * 3
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3) * 0.5 - origins, dim=-1)
+    grid = (torch.rand(32, 32, 32) < fill).to(torch.uint8)
+    place = ((origins, directions, torch.zeros(rays)), (torch.tensor([0.1, 0.0, 0.2]), 1.5), grid, (0.0, 60.0, 0.05))
+    field = (tables, geometric_levels(8, 64, 4), nets)
+    for fast, truth in zip(cpu.render(*place, field, 7.0), reference.render(*place, field, 7.0)):
+        assert fast.shape == truth.shape
+        off = (fast - truth).abs() > 1e-3 * (1 + truth.abs())
+        assert off.float().mean() < 0.01 if rays else off.numel() == 0  # a sample may fall to either side of a border
+
+
 def test_train_step_is_the_same_bit_for_bit_for_any_number_of_threads() -> None:
     import numba
 

@@ -371,7 +371,7 @@ class _Fit:
         aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
         where = (space, sampler.grid, sampler.lattice)
-        done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, sampler.fine)
+        done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, fine=sampler.fine)
         rate = rate_factor((1 + progress) / 2 if self.goes_on else progress)
         if self.adam.step(self.config.rate * rate, done.loss):
             self.loss = done.loss if math.isnan(self.loss) else self.loss + 0.03 * (done.loss - self.loss)

@@ -100,6 +100,19 @@ def march_visible(
     return _twin(grid).march_visible(rays, space, grid, lattice, net, stop, fine)
 
 
+def render(
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    stop: float,
+    fine: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `reference.render`."""
+    return _twin(grid).render(rays, space, grid, lattice, field, stop, fine)
+
+
 def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, step: int) -> None:
     """See `reference.adam`."""
     _twin(param).adam(param, grad, first, second, rate, step)

@@ -107,6 +107,8 @@ class Unwanted(NamedTuple):
 
 BURNT = 254.5 / 255
 """a photo's colour above which it may have been brighter still"""
+TRACE = 0.05
+"""light that reaches a background which goes on for ever, and would move the mean distance there"""
 PRIMES = (1, 2654435761, 805459861)  # the spatial hash of Teschner et al. 2003, as in Instant-NGP, Eq. 4
 
 
@@ -289,6 +291,34 @@ def march_visible(
     keep = _exclusive_sum(sigma * (t1 - t0), offsets) < stop
     counts = torch.zeros(len(offsets) - 1, dtype=torch.long, device=ids.device).index_add(0, ids, keep.long())
     return t0[keep], t1[keep], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+
+
+def render(
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    stop: float,
+    fine: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What rays see of a hash field, without gradients: rgb (N, 3) on black, depth (N,), opacity (N,); see
+    `refield.field.volrend.Rendering`."""
+    tables, resolutions, networks = field
+    origins, directions, _ = rays
+    with torch.no_grad():
+        net = (tables, resolutions, networks[0], networks[1][0])
+        t0, t1, offsets = march_visible(rays, space, grid, lattice, net, stop, fine)
+        ids, mid = _ray_ids(offsets), (t0 + t1) / 2
+        unit = (contract(origins[ids] + directions[ids] * mid[:, None], *space) + 2) / 4
+        raw, rgbs = hash_field(unit, directions[ids], tables, resolutions, networks)
+        tau = truncated_exp(raw) / space[1] * (t1 - t0)
+        before = torch.exp(-_exclusive_sum(tau, offsets))
+        w = before * -torch.expm1(-tau)
+        lit = (before > TRACE).to(w.dtype)
+        values = torch.cat([rgbs, torch.stack([lit * mid, lit, torch.ones_like(mid)], -1)], -1)
+        summed = accumulate(w, values, offsets)
+        return summed[:, :3], summed[:, 3] / summed[:, 4].clamp_min(1e-6), summed[:, 5]
 
 
 def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, step: int) -> None:

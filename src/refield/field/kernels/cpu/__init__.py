@@ -10,6 +10,7 @@ from refield.field.kernels.cpu.marching import hash_density, march, march_visibl
 from refield.field.kernels.cpu.networks import hash_field
 from refield.field.kernels.cpu.optimiser import adam, keep, observe, scatter_max
 from refield.field.kernels.cpu.rays import accumulate, contract, distortion, spherical_harmonics, weights
+from refield.field.kernels.cpu.rendering import render
 from refield.field.kernels.cpu.step import train_step
 from refield.field.kernels.cpu.woven import woven_step
 
@@ -27,6 +28,7 @@ __all__ = [
     "narrow",
     "note",
     "observe",
+    "render",
     "scatter_max",
     "spherical_harmonics",
     "spread",
