@@ -397,6 +397,7 @@ class _Fit:
         self.model.sampler = replace(self.model.sampler, step=self.finest_step * to)
 
     def _look(self, step: int) -> float:
+        self.photos.inform(self.judge)
         psnr = self.judge.psnr(self.model, self.photos.exposing)
         self.model.train()
         if self.on_progress:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from refield.field.exposures import ExposureFit, basis_of
+from refield.field.exposures import ExposureFit
 from refield.field.kernels.reference import Batch, Stepped
 from refield.field.photos import HeldOut
 from refield.field.pixels import PixelBank
@@ -18,10 +18,12 @@ from refield.field.poses import PoseFit
 from refield.field.radiance import Field
 from refield.field.sampling import OccupancySampler
 from refield.field.trust import PhotoTrust
-from refield.scene.capture import Capture, Frame, Rays
+from refield.scene.camera import Camera
+from refield.scene.capture import Capture, Frame
 from refield.scene.exposure import Exposure
 
 _EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.1, 0.25, 0.1  # of a fit: what is asked of it must be there first
+_COARSE = 4  # cells of the occupancy grid are one place where rays end, a side
 _MOVING = 4  # every so-many-th ray tells how poses are wrong
 
 
@@ -41,7 +43,6 @@ class Asked(NamedTuple):
     """A step's rays, and what the model has to remember of them until it hears what came of them."""
 
     batch: Batch
-    rays: Rays
     pixels: Tensor
     owner: Tensor
     basis: Tensor | None
@@ -55,12 +56,14 @@ class PhotoModel:
         self.bank = bank
         frames = bank.frames
         distance = torch.stack([f.centre.float() - sampler.contraction.centre for f in frames]).norm(dim=-1).median()
-        self.exposures = ExposureFit(frames) if config.exposures else None
+        self._side = sampler.resolution
+        places = (-(-self._side // _COARSE)) ** 3
+        self.exposures = ExposureFit(frames, places) if config.exposures else None
         self.exposing = False
         """whether they are heeded; set by the fit, which knows photos that are left out"""
         self._asked_whether = False
         self.poses = PoseFit(frames, float(distance)) if config.poses else None
-        self.trust = PhotoTrust(bank, sampler.resolution**3) if config.trust else None
+        self.trust = PhotoTrust(bank, places) if config.trust else None
 
     def may_expose(self, progress: float) -> bool:
         """Whether now, once in a fit, is to be found out if the photos' exposures differ at all: gains of photos that
@@ -79,7 +82,7 @@ class PhotoModel:
             rays = self.poses.rays(owner, bank.camera_directions(pixels, owner))
         gains = basis = patches = trust = None
         if self.exposures is not None and self.exposing:
-            basis = basis_of(bank, pixels, owner)
+            basis = bank.vignetting_basis(pixels, owner)
             gains = self.exposures.gains(owner, basis)
         if self.trust is not None and progress >= _TRUSTED_FROM:
             patches = self.trust.patches(pixels, owner)
@@ -88,34 +91,59 @@ class PhotoModel:
         # what stays transparent is shown noise, so that only opaque surfaces explain the photos
         lines = (rays.origins, rays.directions, torch.rand(n))
         batch = Batch(lines, bank.colours(pixels), torch.rand(n, 3), gains, trust, moving)
-        return Asked(batch, rays, pixels, owner, basis, patches)
+        return Asked(batch, pixels, owner, basis, patches)
 
     def learn(self, asked: Asked, done: Stepped, progress: float, rate: float) -> None:
         """Take in what a step found; ``rate`` in [0, 1] falls as the fit's."""
         batch, owner = asked.batch, asked.owner
         if self.exposures is not None and asked.basis is not None:
             assert batch.gains is not None and done.shown is not None and done.errors is not None
-            weight = 1.0 if batch.trust is None else batch.trust[:, None]
-            self.exposures.learn(owner, asked.basis, batch.gains * done.shown, weight * done.errors, rate)
-        if self.poses is not None and done.to_rays is not None:
-            self.poses.learn(owner, asked.rays, done.to_rays, rate)
+            weight = 1.0 if batch.trust is None else batch.trust[:, None].sqrt()
+            seen, errors = weight * batch.gains * done.shown, weight * done.errors
+            self.exposures.learn(owner, asked.basis, seen, errors, self._surface(done), rate)
+        if self.poses is not None and batch.moving:
+            self.poses.learn(owner, batch, done, rate)
         if self.trust is not None and asked.patches is not None:
-            assert done.heaviest is not None and done.errors is not None
-            surface = torch.where(done.heaviest >= 0, done.cells[done.heaviest.clamp_min(0)], -1)
-            self.trust.learn(asked.patches, surface, done.errors)
+            assert done.errors is not None
+            self.trust.learn(asked.patches, self._surface(done), done.errors)
+
+    def _surface(self, done: Stepped) -> Tensor:
+        """The place where each ray ends, (N,); -1: nowhere."""
+        assert done.heaviest is not None
+        if not len(done.cells):
+            return torch.full_like(done.heaviest, -1)
+        cell, side = done.cells[done.heaviest.clamp_min(0)], self._side
+        i, j, k = (x // _COARSE for x in (cell // (side * side), cell // side % side, cell % side))
+        across = -(-side // _COARSE)
+        return torch.where(done.heaviest >= 0, (i * across + j) * across + k, -1)
+
+    def inform(self, judge: HeldOut) -> None:
+        """Tell the judge what has become known of the cameras."""
+        if self.exposures is None and self.poses is None:
+            return
+        lenses = self._lenses()
+        fallen = [self._vignetting(f.camera) for f in judge.frames]
+        judge.learn([lenses.get(f.camera, f.camera) for f in judge.frames], torch.tensor(fallen).reshape(-1, 3))
 
     def told(self, capture: Capture, judge: HeldOut, field: Field) -> Capture:
         """The capture with what was found: poses and lenses of its training frames, lenses of those that were held
         out, exposures of both."""
+        self.inform(judge)
         found = {f.name: f for f in self._training()}
-        lenses = {old.camera: found[old.name].camera for old in self.bank.frames}
+        lenses = self._lenses()
         gains = judge.gains(field).tolist() if self.exposing else []
-        left_out = {}
-        for i, frame in enumerate(capture.held_out):
-            vignetting = (0.0, 0.0, 0.0) if self.exposures is None else self.exposures.of_camera(frame.camera)
-            exposure = Exposure(tuple(gains[i]), vignetting).on(frame.exposure) if i < len(gains) else frame.exposure
-            left_out[frame.name] = replace(frame, camera=lenses.get(frame.camera, frame.camera), exposure=exposure)
-        return replace(capture, frames=tuple(found.get(f.name) or left_out[f.name] for f in capture.frames))
+        for i, frame in enumerate(judge.frames):
+            exposure = frame.exposure
+            if i < len(gains):
+                exposure = Exposure(tuple(gains[i]), self._vignetting(frame.camera)).on(frame.exposure)
+            found[frame.name] = replace(frame, camera=lenses.get(frame.camera, frame.camera), exposure=exposure)
+        return replace(capture, frames=tuple(found[f.name] for f in capture.frames))
+
+    def _lenses(self) -> dict[Camera, Camera]:
+        return {} if self.poses is None else self.poses.lenses()
+
+    def _vignetting(self, camera: Camera) -> tuple[float, float, float]:
+        return (0.0, 0.0, 0.0) if self.exposures is None else self.exposures.of_camera(camera)
 
     def _training(self) -> tuple[Frame, ...]:
         frames = self.bank.frames if self.poses is None else self.poses.found()

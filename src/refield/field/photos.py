@@ -13,7 +13,8 @@ from refield.field.kernels.reference import BURNT
 from refield.field.pixels import PixelBank
 from refield.field.radiance import Field
 from refield.field.render import render_many
-from refield.scene.capture import Capture, Frame, Rays
+from refield.scene.camera import Camera
+from refield.scene.capture import Capture, Frame, Rays, camera_rays
 
 
 @dataclass(frozen=True)
@@ -72,17 +73,32 @@ class HeldOut:
         masks: Sequence[Tensor | None] | None = None,
     ) -> None:
         """``masks``: see `PixelBank`."""
+        self.frames = frames
         self.rays: Rays | None = None
         if not frames:
             return
         bank = PixelBank(frames, most=count, masks=masks)
         if len(bank):
             chosen = torch.arange(len(bank))
-            self.rays, self.truth = bank.rays(chosen), bank.colours(chosen)
-            self.owner, self.photos = bank.frame_of(chosen), len(frames)
+            self.rays, self.truth, self.owner = bank.rays(chosen), bank.colours(chosen), bank.frame_of(chosen)
+            self._places, self._basis = bank.place_of(chosen), bank.vignetting_basis(chosen, self.owner)
+            self._fallen = torch.ones(len(bank), 1)
             width = torch.tensor([f.camera.width for f in frames])[self.owner]
-            self.left: Tensor = bank.place_of(chosen) % width < width // 2
+            self.left: Tensor = self._places % width < width // 2
             """(P,) bool: pixels of the left halves of photos"""
+
+    def learn(self, cameras: Sequence[Camera], vignetting: Tensor) -> None:
+        """What has become known of the photos' lenses, of each one's as it is now, and of their vignetting (F, 3)."""
+        if self.rays is None:
+            return
+        device, directions = self.rays.origins.device, torch.empty(len(self._places), 3)
+        for i, (frame, camera) in enumerate(zip(self.frames, cameras)):
+            mine = self.owner == i
+            place = self._places[mine]
+            pixels = torch.stack([place % camera.width, place // camera.width], -1) + 0.5
+            directions[mine] = camera_rays(camera, frame.world_from_cam, pixels).directions
+        self.rays = Rays(self.rays.origins, directions.to(device))
+        self._fallen = (vignetting[self.owner] * self._basis).sum(-1, keepdim=True).exp()
 
     def psnr(self, model: Field, exposed: bool = False) -> float:
         """dB over the pixels; NaN if there are none. ``exposed``: the photos' exposures are not known: each one's is
@@ -110,18 +126,18 @@ class HeldOut:
         """How each photo is exposed, by all of its pixels here, (F, 3); see `Exposure.gains`."""
         if self.rays is None:
             return torch.ones(0, 3)
-        rgb = self._shown(model)
-        return self._gains(rgb, torch.ones(len(rgb), dtype=torch.bool))
+        return self._gains(self._shown(model), torch.ones_like(self.left))
 
     def _shown(self, model: Field) -> Tensor:
+        """As the photos show it, but for their gains."""
         if isinstance(model, nn.Module):
             model.eval()
         assert self.rays is not None
-        return render_many(model, self.rays).rgb.clamp(0, 1).to(self.truth.device)
+        return render_many(model, self.rays).rgb.clamp(0, 1).to(self.truth.device) * self._fallen.to(self.truth)
 
     def _gains(self, rgb: Tensor, asked: Tensor) -> Tensor:
         """By least squares over pixels that are asked and not burnt out, (F, 3); 1 where there are none."""
         used = asked[:, None] & (self.truth < BURNT)
         both = torch.stack([rgb * self.truth, rgb * rgb]) * used
-        above, below = torch.zeros(2, self.photos, 3, device=rgb.device).index_add_(1, self.owner, both)
+        above, below = torch.zeros(2, len(self.frames), 3, device=rgb.device).index_add_(1, self.owner, both)
         return torch.where(below > 1e-6, above / below.clamp_min(1e-6), 1.0)

@@ -52,6 +52,7 @@ class PixelBank:
         self._centres = torch.stack([f.centre for f in frames]).float()
         self._cameras = list(dict.fromkeys(f.camera for f in frames))
         self._camera_of = torch.tensor([self._cameras.index(f.camera) for f in frames])
+        self._sizes = torch.tensor([(c.width, c.height) for c in self._cameras])
         self._tables: dict[Camera, Tensor] = {}
         distinct = sum(c.width * c.height for c in self._cameras)
         # a few pixels of large photos, as those that judge a fit, are not worth the others' directions
@@ -85,6 +86,14 @@ class PixelBank:
             mine = slice(None) if len(self._cameras) == 1 else (self._camera_of[owner] == k).nonzero()[:, 0]
             d[mine] = self._directions(camera, local[mine])
         return d
+
+    def vignetting_basis(self, pixels: Tensor, owner: Tensor) -> Tensor:
+        """`refield.scene.exposure.vignetting_basis` at pixels (B,) of photos ``owner`` (B,), (B, 3)."""
+        local = self._place_of(pixels, owner)
+        width, height = (side[self._camera_of[owner]] for side in self._sizes.T)
+        x, y = (local % width + 0.5) - width / 2, (local // width + 0.5) - height / 2
+        square = (x * x + y * y) / ((width / 2) ** 2 + (height / 2) ** 2)
+        return torch.stack([square, square**2, square**3], -1)
 
     def colours(self, pixels: Tensor) -> Tensor:
         """(B,) -> (B, 3) float32 in [0, 1]."""
