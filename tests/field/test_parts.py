@@ -76,8 +76,9 @@ def test_a_part_is_left_out_once_rays_found_nothing_in_it_twice() -> None:
         kept, fine = parts.narrowed(grid)
         assert bits_of(fine)[32:36, 32:36, 32:36].sum() == left
     assert kept.view(-1)[cell] == 0 and kept.sum() == R**3 - 1
-    parts.forget(torch.tensor([cell]))
-    assert parts.narrowed(grid)[0].all()
+    kept, fine = parts.narrowed(grid, torch.tensor([cell]))  # tried again
+    assert kept.all() and fine.view(-1)[cell] == -1
+    assert not parts.narrowed(grid)[0].all()
 
 
 def test_what_is_opaque_is_never_left_out_in_the_end() -> None:
@@ -85,7 +86,8 @@ def test_what_is_opaque_is_never_left_out_in_the_end() -> None:
     with torch.no_grad():
         model.encoding.tables.mul_(1.5e5)
     parts, sampler = Parts(model), model.sampler
-    grid, fine = parts.settled(sampler.grid, 0.3, torch.full((R**3,), 10.0))
+    parts.probe(torch.arange(R**3), 0.3, 2)
+    grid, fine = parts.narrowed(sampler.grid)
     settled = replace(sampler, grid=grid, fine=fine)
     x = torch.rand(20_000, 3) * 2 - 1
     cells, _ = sampler.places(x)

@@ -24,6 +24,7 @@ _CAMERAS = 2.0
 # A sample's opacity; once surfaces have become sharp, what is thinner than this where cameras stand is haze: for the
 # cameras opposite it is a part of their background, for a new camera it lies before everything
 _HAZE = 0.3
+_WORTH, _PROBES = 8, 2  # samples of all in the end for which a cell is worth to be probed; points in each of its parts
 _BACKGROUND = 5.0  # core radii; a cell that no ray ever crossed is taken for empty, unless it is further out
 
 
@@ -71,8 +72,8 @@ class OccupancyTrainer:
         kernels.observe(self.state, self.rounds, DECAY, cells, w, sigmas)
         if parts is not None and self.sharp:
             self.parts = self.parts or Parts(self.model)
-            self.parts.observe(cells, parts, self.parts.opacity(cells, sigmas) > self._opacity)
-            self.parts.probe(cells, self._opacity)
+            self.parts.observe(cells, parts, self._shows(cells, w, sigmas))
+            self.parts.probe_used(cells, self._opacity)
         every = EVERY if step < _OFTEN_UNTIL else 2 * EVERY
         if step % every == every - 1:
             self.renew(step)
@@ -89,11 +90,9 @@ class OccupancyTrainer:
             # a few hidden cells get another chance, since geometry still changes
             again = self.open[torch.randint(len(self.open), (len(self.open) // 100,), device=self.open.device)]
             self.state[again, 1] = self.state[again, 1].clamp_min(4 * _WEIGHT)
-            if self.parts is not None:  # as those that are probed
-                self.parts.forget(cells)
         self.sharp = step >= 4 * self.cull_from
         grid = self._kept(_WEIGHT if step >= self.cull_from else -1.0, self.sharp)
-        self.model.looking_where(*((grid,) if self.parts is None else self.parts.narrowed(grid)))
+        self.model.looking_where(*((grid,) if self.parts is None else self.parts.narrowed(grid, cells)))
         self.rounds += 1
 
     def _probe(self, cells: Tensor) -> Tensor:
@@ -104,6 +103,11 @@ class OccupancyTrainer:
             unit = (corner + torch.rand(len(cells), 3, device=cells.device)) / r
             sigma = model.sigma(kernels.hash_density(unit, model.density_net))
         return -torch.expm1(-sigma * self.state[cells, 2])
+
+    def _shows(self, cells: Tensor, w: Tensor, sigmas: Tensor) -> Tensor:
+        """Whether samples (S,) are a reason to look into their part of their cell, (S,) bool."""
+        assert self.parts is not None
+        return (self.parts.opacity(cells, sigmas) > self._opacity) & (w > _WEIGHT / 2)
 
     def _kept(self, weight: float, only_seen: bool) -> Tensor:
         """The cells that are opaque enough and have a weight above ``weight``, (R, R, R) uint8."""
@@ -125,9 +129,8 @@ class OccupancyTrainer:
         for _ in range(2):
             for cells in opaque.split(1 << 18):
                 self.state[cells, 0] = torch.maximum(self.state[cells, 0], self._probe(cells))
-        self.model.looking_where(self._kept(-1.0, False))
-        parts = self.parts or Parts(self.model)
-        parts.forget_all()
+        parts = self.parts = self.parts or Parts(self.model)
+        self.model.looking_where(*parts.narrowed(self._kept(-1.0, False)))
         samples = torch.zeros_like(self.state[:, 0])
         self.state[:, 1] = torch.where(self.state[:, 3] >= 0, self.state[:, 1], 0)
         for chosen in torch.randint(len(pixels), (rays,)).split(CHUNK):
@@ -135,9 +138,11 @@ class OccupancyTrainer:
             with torch.no_grad():
                 found = self.model.samples(r, jitter=True)
                 x, _ = found.positions(r)
-                w = weights(self.model.density(x), found)
+                sigmas = self.model.density(x)
+                w = weights(sigmas, found)
             cells, part = self.model.sampler.places(x)
             kernels.scatter_max(w, cells, self.state[:, 1])
-            parts.observe(cells, part, w > _WEIGHT / 2)
+            parts.observe(cells, part, self._shows(cells, w, sigmas))
             samples.index_add_(0, cells, torch.ones_like(w))
-        self.model.looking_where(*parts.settled(self._kept(_WEIGHT / 2, False), self._opacity, samples))
+        parts.probe((samples >= _WORTH).nonzero()[:, 0], self._opacity, _PROBES)
+        self.model.looking_where(*parts.narrowed(self._kept(_WEIGHT / 2, False)))

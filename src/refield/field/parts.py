@@ -10,11 +10,9 @@ from refield.field import kernels
 from refield.field.kernels.masks import ASKED, ASKED_NOW, SHOWN_NOW
 from refield.field.radiance import HashField
 
-_PROBES = 2  # points in each part; beside a part that is opaque at one of them all are kept
 _CELLS = 4096  # that are probed at once
 _SAMPLES = 32  # in training, a cell is probed for so many; each of its 64 parts costs some hundredth of a sample
 _ALL = -1  # parts
-_WORTH = 8  # samples in a cell, of all that fall along the training rays in the end: it is worth to be probed
 
 
 class Parts:
@@ -43,38 +41,26 @@ class Parts:
         """What samples in parts (S,) of cells (S,), int64, turned out to be, (S,) bool."""
         kernels.note(self._known, cells, parts, opaque)
 
-    def probe(self, cells: Tensor, opacity: float) -> None:
-        """Ask all parts of some of the cells (S,) in which samples were: the more samples, the sooner."""
+    def probe(self, cells: Tensor, opacity: float, often: int = 1) -> None:
+        """Ask the parts of cells (K,) of which nothing is known yet, each at ``often`` random points."""
+        for some in cells.split(_CELLS):
+            unknown = ~self._known[some, ASKED]
+            self._known[some, SHOWN_NOW] |= self._probed(some, opacity, often) & unknown
+            self._known[some, ASKED_NOW] |= unknown
+
+    def probe_used(self, cells: Tensor, opacity: float) -> None:
+        """Ask the parts of some of the cells (S,) in which samples were: the more samples, the sooner."""
         unknown = cells[self._known[cells, ASKED] != _ALL]
-        if len(unknown) == 0:
-            return
-        some = unknown[torch.randint(len(unknown), (len(cells) // _SAMPLES + 1,), device=cells.device)].unique()
-        self._known[some, SHOWN_NOW] |= self._probed(some, opacity, 1)
-        self._known[some, ASKED_NOW] = _ALL
+        if len(unknown):
+            drawn = torch.randint(len(unknown), (len(cells) // _SAMPLES + 1,), device=cells.device)
+            self.probe(unknown[drawn].unique(), opacity)
 
-    def forget(self, cells: Tensor) -> None:
-        """Take it that no part of cells (K,) was ever asked."""
-        self._known[cells, ASKED] = 0
-
-    def forget_all(self) -> None:
-        self._known.zero_()
-
-    def narrowed(self, grid: Tensor) -> tuple[Tensor, Tensor]:
+    def narrowed(self, grid: Tensor, tried: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The grid (R, R, R) uint8 without cells that are empty in all parts, and the masks (R, R, R) int64 of the
-        others."""
+        others. The cells ``tried`` (K,) are shown whole: what was left out may hold something by now."""
         fine = kernels.narrow(self._known, grid)
-        return grid * (fine != 0), fine
-
-    def settled(self, grid: Tensor, opacity: float, samples: Tensor) -> tuple[Tensor, Tensor]:
-        """As :func:`narrowed`, from what was opaque since all was forgotten, or is more so than ``opacity`` now.
-
-        ``samples`` (R**3,) says how many fell into each cell. Those with few are left whole.
-        """
-        shown = grid.reshape(-1) > 0
-        full = torch.where(shown, self._known[:, SHOWN_NOW] | _ALL * (samples < _WORTH), 0)
-        for cells in (shown & (samples >= _WORTH)).nonzero()[:, 0].split(_CELLS):
-            full[cells] |= self._probed(cells, opacity, _PROBES)
-        fine = torch.where(grid > 0, kernels.spread(full.reshape(grid.shape)), 0)
+        if tried is not None:
+            fine.view(-1)[tried] = _ALL
         return grid * (fine != 0), fine
 
     def _probed(self, cells: Tensor, opacity: float, times: int) -> Tensor:
