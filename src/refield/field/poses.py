@@ -19,7 +19,7 @@ from refield.scene.capture import Frame, Rays
 from refield.scene.pose import exp
 
 _MEMORY = 500.0  # rays of a photo after which a little more is forgotten than learnt: the field learns, too
-_LIKELY = 1.0  # pixels: how far off poses and lenses usually are; photos that show too little to tell keep theirs
+_LIKELY = 0.5  # pixels: how far off poses and lenses usually are; photos that show too little to tell keep theirs
 _FAR = 8.0  # pixels: poses from structure from motion are not further off; a photo that wants more is not followed
 _SHARED = 3  # photos of one camera from which its lens can be told from their poses
 _FAINT = (1 / 255) ** 2  # errors below say little of how a ray's colour changes
@@ -81,14 +81,15 @@ class PoseFit:
         off = off if batch.trust is None else off * batch.trust[:n]
         self._noise += (float(off.mean()) / 3 - self._noise) * (0.05 if self._noise else 1.0)
         rays = torch.bincount(owner, minlength=len(self.frames))
-        step = self._followed(self._known, self.moved, (owner, turned, off), rays)
+        step = self._followed(self._known, self.moved, (owner, turned, off), rays, torch.ones(len(rays)))
         self.moved -= rate * step
         self.moved -= (self._common @ (self.moved.reshape(-1) @ self._common)).view_as(self.moved)
         self.moved.clamp_(-_FAR, _FAR)
         camera = self.camera_of[owner]
         parts = self._lens_parts(owner, d, to_d) * self._lens_unit[camera]
         rays = torch.bincount(camera, minlength=len(self._cameras)) / self._photos
-        self.lens -= rate * self._shared * self._followed(self._lens_known, self.lens, (camera, parts, off), rays)
+        told = camera, parts, off
+        self.lens -= rate * self._shared * self._followed(self._lens_known, self.lens, told, rays, self._photos)
         self._pose()
 
     def _lens_parts(self, owner: Tensor, d: Tensor, to_d: Tensor) -> Tensor:
@@ -98,7 +99,9 @@ class PoseFit:
         along = (seen[:, :2] * own[:, :2]).sum(-1, keepdim=True)
         return torch.cat([along, -seen[:, :2] * own[:, 2:]], -1)
 
-    def _followed(self, known: Tensor, at: Tensor, told: tuple[Tensor, Tensor, Tensor], rays: Tensor) -> Tensor:
+    def _followed(
+        self, known: Tensor, at: Tensor, told: tuple[Tensor, Tensor, Tensor], rays: Tensor, photos: Tensor
+    ) -> Tensor:
         """How far parameters ``at`` (K, P) are to go back: rays' owners (N,), gradients (N, P) and errors (N,) are
         taken into what is ``known`` of the curvature (K, P, P), and the likely size of the parameters is heeded."""
         owner, slopes, off = told
@@ -107,8 +110,8 @@ class PoseFit:
         bend = slopes[:, :, None] * (slopes / (off + _FAINT)[:, None])[:, None]
         share = (rays / _MEMORY).clamp(max=1)[:, None]
         known.mul_(1 - share[:, None]).index_add_(0, owner, bend)
-        likely = max(self._noise, _FAINT) / _LIKELY**2
-        return torch.linalg.solve(known + likely * torch.eye(at.shape[1]), slope + share * likely * at)
+        likely = max(self._noise, _FAINT) / _LIKELY**2 * photos[:, None]
+        return torch.linalg.solve(known + likely[:, None] * torch.eye(at.shape[1]), slope + share * likely * at)
 
     def _in_common(self) -> Tensor:
         """Changes of all poses that are no change of the photos, or one of their lens: orthonormal columns (6 F, K)."""
