@@ -23,7 +23,6 @@ from refield.field.kernels.reference import (  # torch's own kernels do for thos
     keep,
     narrow,
     note,
-    spread,
     woven_step,
 )
 
@@ -46,7 +45,6 @@ __all__ = [
     "ray_ids",
     "scatter_max",
     "spherical_harmonics",
-    "spread",
     "train_step",
     "weights",
     "woven_step",
