@@ -38,14 +38,6 @@ def field() -> HashField:
     return HashField(HashFieldConfig(levels=2, coarsest=4, finest=8, log2_table=8), sampler)
 
 
-def test_spread_reaches_the_parts_beside_in_other_cells() -> None:
-    torch.manual_seed(0)
-    bits = torch.rand(4 * R, 4 * R, 4 * R) < 0.01
-    expected = torch.nn.functional.max_pool3d(bits[None, None].float(), 3, 1, 1)[0, 0] > 0
-    for twin in (reference, cpu):
-        assert (bits_of(twin.spread(masks_of(bits))) == expected).all()
-
-
 def test_twins_know_the_same() -> None:
     torch.manual_seed(1)
     grid = (torch.rand(R, R, R) < 0.7).to(torch.uint8)
@@ -67,11 +59,11 @@ def test_a_part_is_left_out_once_rays_found_nothing_in_it_twice() -> None:
     parts, grid = Parts(model), model.sampler.grid
     cell, every = (8 * R + 8) * R + 8, torch.arange(64)
     there = torch.full((64,), cell)
-    parts.observe(there, every, every == 21)  # it and the 26 beside it fill the cell's lower corner
+    parts.observe(there, every, every == 21)
     kept, fine = parts.narrowed(grid)
     assert kept.all() and fine.view(-1)[cell + 1] == -1  # nothing was asked there
-    assert bits_of(fine)[32:36, 32:36, 32:36].nonzero().amax() == 2
-    for left in (27, 0):
+    assert fine.view(-1)[cell] == 1 << 21
+    for left in (1, 0):
         parts.observe(there, every, every < 0)
         kept, fine = parts.narrowed(grid)
         assert bits_of(fine)[32:36, 32:36, 32:36].sum() == left
@@ -81,20 +73,24 @@ def test_a_part_is_left_out_once_rays_found_nothing_in_it_twice() -> None:
     assert not parts.narrowed(grid)[0].all()
 
 
-def test_what_is_opaque_is_never_left_out_in_the_end() -> None:
+def test_cells_are_probed_where_samples_are_and_opaque_parts_stay() -> None:
+    torch.manual_seed(3)
     model = field()
     with torch.no_grad():
         model.encoding.tables.mul_(1.5e5)
     parts, sampler = Parts(model), model.sampler
-    parts.probe(torch.arange(R**3), 0.3, 2)
+    used = torch.arange(R**3)[::2]
+    for _ in range(300):
+        parts.probe(used, 0.3)
     grid, fine = parts.narrowed(sampler.grid)
-    settled = replace(sampler, grid=grid, fine=fine)
-    x = torch.rand(20_000, 3) * 2 - 1
+    asked = replace(sampler, grid=grid, fine=fine)
+    x = torch.rand(40_000, 3) * 2 - 1
     cells, _ = sampler.places(x)
     opaque = parts.opacity(cells, model.density(x)) > 0.5
-    assert 0.003 < opaque.float().mean() < 0.9
-    assert settled.occupied(x)[opaque].float().mean() > 0.999
-    assert settled.occupied(x).float().mean() < 0.95
+    assert 0.003 < opaque.float().mean() < 0.5
+    looked = asked.occupied(x)
+    assert looked[opaque].float().mean() > 0.9 and looked[cells % 2 == 1].all()
+    assert looked[cells % 2 == 0].float().mean() < 0.3
 
 
 def test_a_sampler_looks_into_open_parts_alone() -> None:

@@ -22,9 +22,9 @@ _PROBED_AT_FIRST, _PROBED = 16, 64  # one in so many cells, each time
 # benefit of the doubt a photo's background is learnt as haze before the cameras opposite, and new views meet it
 _CAMERAS = 2.0
 # A sample's opacity; once surfaces have become sharp, what is thinner than this where cameras stand is haze: for the
-# cameras opposite it is a part of their background, for a new camera it lies before everything
+# cameras opposite it is a part of their background, for a new camera it lies before everything. So is a part of a cell
+# anywhere that is thinner than this from side to side: surfaces find room in what is left
 _HAZE = 0.3
-_WORTH, _PROBES = 8, 2  # samples of all in the end for which a cell is worth to be probed; points in each of its parts
 _BACKGROUND = 5.0  # core radii; a cell that no ray ever crossed is taken for empty, unless it is further out
 
 
@@ -49,7 +49,6 @@ class OccupancyTrainer:
         self.sharp = False
         self.parts: Parts | None = None
         """of cells; from the first step on that says in which its samples were"""
-        self._opacity = _OPACITY  # the least that is kept
         self.among_cameras = torch.zeros(cells, dtype=torch.bool, device=device)
         self.state = large_zeros(cells, 4).to(device)
         """see `kernels.reference.observe`"""
@@ -72,8 +71,7 @@ class OccupancyTrainer:
         kernels.observe(self.state, self.rounds, DECAY, cells, w, sigmas)
         if parts is not None and self.sharp:
             self.parts = self.parts or Parts(self.model)
-            self.parts.observe(cells, parts, self._shows(cells, w, sigmas))
-            self.parts.probe_used(cells, self._opacity)
+            self._ask(self.parts, (cells, parts), w, sigmas)
         every = EVERY if step < _OFTEN_UNTIL else 2 * EVERY
         if step % every == every - 1:
             self.renew(step)
@@ -92,7 +90,7 @@ class OccupancyTrainer:
             self.state[again, 1] = self.state[again, 1].clamp_min(4 * _WEIGHT)
         self.sharp = step >= 4 * self.cull_from
         grid = self._kept(_WEIGHT if step >= self.cull_from else -1.0, self.sharp)
-        self.model.looking_where(*((grid,) if self.parts is None else self.parts.narrowed(grid, cells)))
+        self._show(grid, cells)
         self.rounds += 1
 
     def _probe(self, cells: Tensor) -> Tensor:
@@ -104,22 +102,26 @@ class OccupancyTrainer:
             sigma = model.sigma(kernels.hash_density(unit, model.density_net))
         return -torch.expm1(-sigma * self.state[cells, 2])
 
-    def _shows(self, cells: Tensor, w: Tensor, sigmas: Tensor) -> Tensor:
-        """Whether samples (S,) are a reason to look into their part of their cell, (S,) bool."""
-        assert self.parts is not None
-        return (self.parts.opacity(cells, sigmas) > self._opacity) & (w > _WEIGHT / 2)
+    def _ask(self, known: Parts, places: tuple[Tensor, Tensor], w: Tensor, sigmas: Tensor) -> None:
+        """Note which parts samples of weights (S,) and densities (S,) are a reason to look into; and probe some."""
+        known.observe(*places, (known.opacity(places[0], sigmas) > _HAZE) & (w > _WEIGHT / 2))
+        known.probe(places[0], _HAZE)
+
+    def _show(self, grid: Tensor, tried: Tensor | None = None) -> None:
+        """Look into the cells (R, R, R) uint8, as far as their parts are not known to be empty."""
+        self.model.looking_where(*((grid,) if self.parts is None else self.parts.narrowed(grid, tried)))
 
     def _kept(self, weight: float, only_seen: bool) -> Tensor:
         """The cells that are opaque enough and have a weight above ``weight``, (R, R, R) uint8."""
-        self._opacity = min(_OPACITY, float(self.state[:, 0].mean()))
+        opacity = min(_OPACITY, float(self.state[:, 0].mean()))
         allowed = self.allowed
         if self.sharp:
             allowed = allowed & ~(self.among_cameras & (self.state[:, 0] < _HAZE))
-        grid = kernels.keep(self.state, allowed, self._opacity, weight, only_seen)
+        grid = kernels.keep(self.state, allowed, opacity, weight, only_seen)
         return grid.reshape(self.model.sampler.grid.shape)
 
     def settle(self, pixels: PixelBank, rays: int = 200_000) -> None:
-        """The final grid and masks: every opaque cell that some training ray sees, and its opaque parts.
+        """The final grid: every opaque cell that some training ray sees, without the parts that are known to be empty.
 
         Leaves the model in training mode.
 
@@ -129,20 +131,17 @@ class OccupancyTrainer:
         for _ in range(2):
             for cells in opaque.split(1 << 18):
                 self.state[cells, 0] = torch.maximum(self.state[cells, 0], self._probe(cells))
-        parts = self.parts = self.parts or Parts(self.model)
-        self.model.looking_where(*parts.narrowed(self._kept(-1.0, False)))
-        samples = torch.zeros_like(self.state[:, 0])
+        self._show(self._kept(-1.0, False))
         self.state[:, 1] = torch.where(self.state[:, 3] >= 0, self.state[:, 1], 0)
         for chosen in torch.randint(len(pixels), (rays,)).split(CHUNK):
             r = pixels.rays(chosen)
             with torch.no_grad():
-                found = self.model.samples(r, jitter=True)
-                x, _ = found.positions(r)
+                samples = self.model.samples(r, jitter=True)
+                x, _ = samples.positions(r)
                 sigmas = self.model.density(x)
-                w = weights(sigmas, found)
-            cells, part = self.model.sampler.places(x)
+                w = weights(sigmas, samples)
+            cells, parts = self.model.sampler.places(x)
             kernels.scatter_max(w, cells, self.state[:, 1])
-            parts.observe(cells, part, self._shows(cells, w, sigmas))
-            samples.index_add_(0, cells, torch.ones_like(w))
-        parts.probe((samples >= _WORTH).nonzero()[:, 0], self._opacity, _PROBES)
-        self.model.looking_where(*parts.narrowed(self._kept(_WEIGHT / 2, False)))
+            if self.parts is not None:
+                self._ask(self.parts, (cells, parts), w, sigmas)
+        self._show(self._kept(_WEIGHT / 2, False))

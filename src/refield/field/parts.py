@@ -10,7 +10,6 @@ from refield.field import kernels
 from refield.field.kernels.masks import ASKED, ASKED_NOW, SHOWN_NOW
 from refield.field.radiance import HashField
 
-_CELLS = 4096  # that are probed at once
 _SAMPLES = 32  # in training, a cell is probed for so many; each of its 64 parts costs some hundredth of a sample
 _ALL = -1  # parts
 
@@ -18,8 +17,9 @@ _ALL = -1  # parts
 class Parts:
     """What samples found in each cell's 4^3 parts.
 
-    A part that rays passed through and that is empty, as all beside it are, is left out. What was not asked yet stays:
-    so cells that cost the most samples are known first.
+    A part that rays passed through and in which nothing is opaque is left out. What was not asked yet stays: so cells
+    that cost the most samples are known first. What the field shows has to find room in the parts that are left, and
+    surfaces become thinner by it: a field that was not trained so needs all its parts.
     """
 
     def __init__(self, model: HashField) -> None:
@@ -41,19 +41,15 @@ class Parts:
         """What samples in parts (S,) of cells (S,), int64, turned out to be, (S,) bool."""
         kernels.note(self._known, cells, parts, opaque)
 
-    def probe(self, cells: Tensor, opacity: float, often: int = 1) -> None:
-        """Ask the parts of cells (K,) of which nothing is known yet, each at ``often`` random points."""
-        for some in cells.split(_CELLS):
-            unknown = ~self._known[some, ASKED]
-            self._known[some, SHOWN_NOW] |= self._probed(some, opacity, often) & unknown
-            self._known[some, ASKED_NOW] |= unknown
-
-    def probe_used(self, cells: Tensor, opacity: float) -> None:
-        """Ask the parts of some of the cells (S,) in which samples were: the more samples, the sooner."""
+    def probe(self, cells: Tensor, opacity: float) -> None:
+        """Ask the unknown parts of some of the cells (S,) in which samples were, the more samples the sooner."""
         unknown = cells[self._known[cells, ASKED] != _ALL]
-        if len(unknown):
-            drawn = torch.randint(len(unknown), (len(cells) // _SAMPLES + 1,), device=cells.device)
-            self.probe(unknown[drawn].unique(), opacity)
+        if len(unknown) == 0:
+            return
+        some = unknown[torch.randint(len(unknown), (len(cells) // _SAMPLES + 1,), device=cells.device)].unique()
+        asked = ~self._known[some, ASKED]
+        self._known[some, SHOWN_NOW] |= self._probed(some, opacity) & asked
+        self._known[some, ASKED_NOW] |= asked
 
     def narrowed(self, grid: Tensor, tried: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The grid (R, R, R) uint8 without cells that are empty in all parts, and the masks (R, R, R) int64 of the
@@ -63,17 +59,13 @@ class Parts:
             fine.view(-1)[tried] = _ALL
         return grid * (fine != 0), fine
 
-    def _probed(self, cells: Tensor, opacity: float, times: int) -> Tensor:
-        """The masks (K,) of parts in which the field is more opaque than that at one of some random
-        points."""
+    def _probed(self, cells: Tensor, opacity: float) -> Tensor:
+        """The masks (K,) of parts that are more opaque than that, going by a random point of each."""
         r, device = self.model.sampler.resolution, cells.device
         side = torch.arange(4, device=device)
         corner = torch.stack([cells // (r * r), cells // r % r, cells % r], -1)[:, None] * 4
         quarter = (corner + torch.cartesian_prod(side, side, side)).reshape(-1, 3)
-        found = torch.zeros(len(quarter), dtype=torch.bool, device=device)
-        owner = cells.repeat_interleave(64)
-        for _ in range(times):
-            unit = (quarter + torch.rand(quarter.shape, device=device)) / (4 * r)
-            sigma = self.model.sigma(kernels.hash_density(unit, self.model.density_net))
-            found |= self.opacity(owner, sigma) > opacity
+        unit = (quarter + torch.rand(quarter.shape, device=device)) / (4 * r)
+        sigma = self.model.sigma(kernels.hash_density(unit, self.model.density_net))
+        found = self.opacity(cells.repeat_interleave(64), sigma) > opacity
         return (found.reshape(-1, 64).long() << torch.arange(64, device=device)).sum(1)

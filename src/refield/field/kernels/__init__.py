@@ -171,8 +171,3 @@ def note(known: Tensor, cells: Tensor, parts: Tensor, opaque: Tensor) -> None:
 def narrow(known: Tensor, grid: Tensor) -> Tensor:
     """See `reference.narrow`."""
     return _twin(known).narrow(known, grid)
-
-
-def spread(masks: Tensor) -> Tensor:
-    """See `reference.spread`."""
-    return _twin(masks).spread(masks)

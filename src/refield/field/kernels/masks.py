@@ -13,18 +13,6 @@ ASKED_NOW, SHOWN_NOW, ASKED, SHOWN, FADING = range(5)
 """columns of what is known of cells, see `note` and `narrow`"""
 
 
-def signed(bits: int) -> int:
-    """64 bits as a number that an int64 can hold."""
-    return bits - (1 << 64) if bits >> 63 else bits
-
-
-AXES = tuple(
-    (shift, signed(low), signed(low << 3 * shift))
-    for shift, low in ((16, 0x000000000000FFFF), (4, 0x000F000F000F000F), (1, 0x1111111111111111))
-)
-"""of each axis: how far apart neighbours' bits are, and the bits of the first and of the last along it"""
-
-
 def marked(places: Tensor, grid: Tensor, fine: Tensor | None) -> Tensor:
     """Whether something may be at places (S, 3), given in cells, -> (S,) bool.
 
@@ -58,26 +46,14 @@ def note(known: Tensor, cells: Tensor, parts: Tensor, opaque: Tensor) -> None:
 def narrow(known: Tensor, grid: Tensor) -> Tensor:
     """End a round of `note`; masks (R, R, R) int64 of the cells that ``grid`` (R, R, R) uint8 shows.
 
-    Left out are sub-cells that were asked and are empty: where nothing was opaque, neither there nor beside it, in the
-    last two rounds that asked. 0 is a cell that is empty altogether.
+    Left out are parts that are empty: nothing in them was opaque in the last two rounds that asked, or the first if
+    nothing ever was. 0 is a cell that is empty altogether.
     """
     rows = (grid.reshape(-1) > 0).nonzero()[:, 0]
     now, opaque, asked, shown, fading = known[rows].unbind(1)
     missed = now & ~opaque
     asked, fading, shown = asked | now, (fading & ~missed) | (shown & missed), opaque | (shown & ~missed)
     known[rows] = torch.stack([torch.zeros_like(now), torch.zeros_like(now), asked, shown, fading], 1)
-    full, unknown = torch.zeros(2, *grid.shape, dtype=torch.int64, device=grid.device)
-    full.view(-1)[rows], unknown.view(-1)[rows] = shown | fading, ~asked
-    return torch.where(grid > 0, spread(full) | unknown, 0)
-
-
-def spread(masks: Tensor) -> Tensor:
-    """Masks (R, R, R) int64 with the 26 sub-cells beside each that is set, in other cells, too."""
-    for axis, (shift, low, high) in enumerate(AXES):
-        none = torch.zeros_like(masks.narrow(axis, 0, 1))
-        inner = masks.shape[axis] - 1
-        before = torch.cat([none, masks.narrow(axis, 0, inner)], axis)
-        behind = torch.cat([masks.narrow(axis, 1, inner), none], axis)
-        within = ((masks << shift) & ~low) | ((masks >> shift) & ~high)
-        masks = masks | within | ((before >> 3 * shift) & low) | ((behind << 3 * shift) & high)
-    return masks
+    out = torch.zeros(grid.shape, dtype=torch.int64, device=grid.device)
+    out.view(-1)[rows] = shown | fading | ~asked
+    return out

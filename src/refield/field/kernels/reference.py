@@ -16,7 +16,6 @@ from torch import Tensor
 from refield.field.kernels.masks import marked, part_of
 from refield.field.kernels.masks import narrow as narrow
 from refield.field.kernels.masks import note as note
-from refield.field.kernels.masks import spread as spread
 
 Rays3 = tuple[Tensor, Tensor, Tensor]
 """origins (N, 3), unit directions (N, 3), jitter (N,) in [0, 1) that shifts each ray's lattice"""

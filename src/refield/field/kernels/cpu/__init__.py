@@ -4,7 +4,7 @@ Loops over samples or rays run in parallel; scatters run in parallel over levels
 sums are over a fixed number of groups: results are the same, bit for bit, for every thread count.
 """
 
-from refield.field.kernels.cpu.cells import narrow, note, spread
+from refield.field.kernels.cpu.cells import narrow, note
 from refield.field.kernels.cpu.encoding import hash_encode
 from refield.field.kernels.cpu.marching import hash_density, march, march_visible
 from refield.field.kernels.cpu.networks import hash_field
@@ -31,7 +31,6 @@ __all__ = [
     "render",
     "scatter_max",
     "spherical_harmonics",
-    "spread",
     "train_step",
     "weights",
     "woven_step",

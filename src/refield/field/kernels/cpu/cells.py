@@ -12,11 +12,11 @@ from torch import Tensor
 
 from refield.field.kernels.cpu.encoding import array
 from refield.field.kernels.cpu.simd import JIT
-from refield.field.kernels.masks import ASKED, ASKED_NOW, AXES, FADING, SHOWN, SHOWN_NOW
+from refield.field.kernels.masks import ASKED, ASKED_NOW, FADING, SHOWN, SHOWN_NOW
 
 BLOCKS, _FAR = 4, 8  # cells a side that are skipped together; the furthest that is looked for, in blocks
 _NO_MASKS = np.zeros((0, 0, 0), np.int64)
-_EMPTY, _ONE_BIT = np.int64(0), np.int64(1)
+_ONE_BIT = np.int64(1)
 
 
 def _reach(grid: np.ndarray) -> np.ndarray:
@@ -75,10 +75,10 @@ def note(known: Tensor, cells: Tensor, parts: Tensor, opaque: Tensor) -> None:
 
 
 @njit(**JIT)
-def _end_round(known, grid, full, begin, end):  # type: ignore[no-untyped-def]
-    """Of cells ``begin : end``; what is full to ``full``."""
+def _end_round(known, grid, out, begin, end):  # type: ignore[no-untyped-def]
+    """Of cells ``begin : end``, and their masks."""
     for c in range(begin, end):
-        full[c] = 0
+        out[c] = 0
         if grid[c] == 0:
             continue
         cell = known[c]
@@ -88,72 +88,17 @@ def _end_round(known, grid, full, begin, end):  # type: ignore[no-untyped-def]
             cell[SHOWN] = cell[SHOWN_NOW] | (cell[SHOWN] & ~missed)
             cell[ASKED] |= cell[ASKED_NOW]
             cell[ASKED_NOW], cell[SHOWN_NOW] = 0, 0
-        full[c] = cell[SHOWN] | cell[FADING]
+        out[c] = cell[SHOWN] | cell[FADING] | ~cell[ASKED]
 
 
 @njit(parallel=True, **JIT)
-def _end_rounds(known, grid, full, side):  # type: ignore[no-untyped-def]
+def _end_rounds(known, grid, out, side):  # type: ignore[no-untyped-def]
     for i in prange(side):
-        _end_round(known, grid, full, i * side * side, (i + 1) * side * side)
-
-
-@njit(**JIT)
-def _unknown(known, grid, masks, begin, end):  # type: ignore[no-untyped-def]
-    for c in range(begin, end):
-        masks[c] = masks[c] | ~known[c, ASKED] if grid[c] > 0 else _EMPTY
-
-
-@njit(parallel=True, **JIT)
-def _open_unknown(known, grid, masks, side):  # type: ignore[no-untyped-def]
-    for i in prange(side):
-        _unknown(known, grid, masks, i * side * side, (i + 1) * side * side)
+        _end_round(known, grid, out, i * side * side, (i + 1) * side * side)
 
 
 def narrow(known: Tensor, grid: Tensor) -> Tensor:
     """See `masks.narrow`."""
-    full, side, flat = torch.empty(grid.shape, dtype=torch.int64), grid.shape[0], array(grid).reshape(-1)
-    _end_rounds(known.numpy(), flat, full.numpy().reshape(-1), side)
-    out = spread(full)
-    _open_unknown(known.numpy(), flat, out.numpy().reshape(-1), side)
-    return out
-
-
-@njit(**JIT)
-def _spread_row(here, before, behind, out, axis):  # type: ignore[no-untyped-def]
-    """One row of cells, with the rows before and behind it along the axis."""
-    shift, low, high = axis[0], axis[1], axis[2]
-    for k in range(len(out)):
-        m = here[k]
-        within = ((m << shift) & ~low) | ((m >> shift) & ~high)
-        out[k] = m | within | ((before[k] >> 3 * shift) & low) | ((behind[k] << 3 * shift) & high)
-
-
-@njit(**JIT)
-def _spread_slab(i, masks, out, room, axes):  # type: ignore[no-untyped-def]
-    """The cells of one i, from those of its neighbours."""
-    side = len(masks)
-    none, whole, wide = room[0, :side], room[1 : side + 1, :side], room[side + 1]
-    none[:] = 0
-    for j in range(side):
-        before = masks[i - 1, j] if i > 0 else none
-        behind = masks[i + 1, j] if i + 1 < side else none
-        _spread_row(masks[i, j], before, behind, whole[j], axes[0])
-    for j in range(side):
-        before = whole[j - 1] if j > 0 else none
-        behind = whole[j + 1] if j + 1 < side else none
-        wide[0], wide[side + 1] = 0, 0
-        _spread_row(whole[j], before, behind, wide[1 : side + 1], axes[1])
-        _spread_row(wide[1 : side + 1], wide[:side], wide[2:], out[i, j], axes[2])
-
-
-@njit(parallel=True, **JIT)
-def _spread(masks, out, room, axes):  # type: ignore[no-untyped-def]
-    for i in prange(len(masks)):
-        _spread_slab(i, masks, out, room[i], axes)
-
-
-def spread(masks: Tensor) -> Tensor:
-    """See `masks.spread`."""
-    out, side = torch.empty_like(masks), len(masks)
-    _spread(array(masks), out.numpy(), np.empty((side, side + 2, side + 2), np.int64), np.array(AXES, np.int64))
+    out = torch.empty(grid.shape, dtype=torch.int64)
+    _end_rounds(known.numpy(), array(grid).reshape(-1), out.numpy().reshape(-1), len(grid))
     return out

@@ -24,7 +24,6 @@ from refield.field.kernels.reference import (  # torch's own kernels do for thos
     keep,
     narrow,
     note,
-    spread,
     woven_step,
 )
 
@@ -48,7 +47,6 @@ __all__ = [
     "render",
     "scatter_max",
     "spherical_harmonics",
-    "spread",
     "train_step",
     "weights",
     "woven_step",
