@@ -107,6 +107,11 @@ class Fitted:
     """with the photos' exposures, poses and lenses as the fit found them, where it was to find them"""
 
 
+# While exposures are found, colours do not depend on where they are seen from: each photo has directions of its own,
+# by which a field would learn its exposure. Of the harmonics' 16 columns in the colours' first matrix one stays, the
+# constant's.
+_PLAIN = 0.5  # of the fit
+_COLOUR_IN, _DIRECTED = 3, 15
 ProgressCallback = Callable[[FitProgress], None]
 StepCallback = Callable[[int, HashField], None]
 """Hears how many steps are done and the field as they left it, in training; it is not to change it."""
@@ -300,6 +305,10 @@ class _Fit:
         self.pixels, self.judge = photos.bank(), photos.judge(config.photos.exposures)
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model)
+        self.plain = config.photos.exposures
+        if self.plain:
+            with torch.no_grad():
+                self.adam.parameters[_COLOUR_IN][:, -_DIRECTED:] = 0
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
@@ -362,6 +371,8 @@ class _Fit:
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
         done = kernels.train_step(asked.batch, space, sampler.grid, sampler.lattice, field, aim, self.adam.grads)
         rate = rate_factor(progress)
+        if self.plain and progress < _PLAIN:
+            self.adam.grads[_COLOUR_IN][:, -_DIRECTED:] = 0
         if self.adam.step(self.config.rate * rate, done.loss):
             self.loss = done.loss if math.isnan(self.loss) else self.loss + 0.03 * (done.loss - self.loss)
             self.occupancy.observe(step, done.cells, done.weights, done.sigmas)
