@@ -14,19 +14,19 @@ from refield.scene.images import write_image
 from refield.scene.pose import exp
 from tests.captures import looking_at
 
-CAMERA = Camera(48, 48, 46.0, 46.0, 24.0, 24.0)
+CAMERA = Camera(48, 48, 40.0, 40.0, 24.0, 24.0)
 """of every photo"""
 Change = Callable[[Tensor, int], Tensor]
 """A photo (H, W, 3) in [0, 1] and its number -> the photo that is taken instead"""
 
 
 def poses(count: int) -> list[Tensor]:
-    """Cameras around a ball, in the room, at three heights."""
-    out = []
+    """Cameras around a ball, in the room, at three heights, that look here and there."""
+    out, g = [], torch.Generator().manual_seed(0)
     for i in range(count):
         a, height = torch.tensor(i * 2.4, dtype=torch.float64), -0.5 + 0.5 * (i % 3)
         eye = torch.stack([2 * a.cos(), 2 * a.sin(), torch.tensor(height, dtype=torch.float64)])
-        out.append(looking_at(eye, torch.zeros(3, dtype=torch.float64)))
+        out.append(looking_at(eye, torch.rand(3, generator=g, dtype=torch.float64) * 1.6 - 0.8))
     return out
 
 

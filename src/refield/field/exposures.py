@@ -1,6 +1,9 @@
 """Exposure, white balance and vignetting, found while a field is fitted to photos: beside the field, not in it.
 
-Letters: F photos, C cameras, N rays of a step. See `refield.scene.exposure` for the model.
+What all photos have in common at a place is the field's, which is still learning; what sets them apart there is theirs.
+So each place's own colour is solved for along with the exposures, and then forgotten: the field is to find it.
+
+Letters: F photos, C cameras, K places, N rays of a step. See `refield.scene.exposure` for the model.
 """
 
 from __future__ import annotations
@@ -14,70 +17,100 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Frame
 from refield.scene.exposure import Exposure
 
-_MEMORY = 1000.0  # rays of a photo after which a little more is forgotten than learnt: the field learns, too
-_DOUBT = 0.5  # what is known before: as much as so many rays of full white say
-_FADE = 0.98  # of what the field lacks where rays end is still so a step later
+_EVERY = 32  # steps from one solution to the next
+_KEPT = 0.7  # of what rays have told is still believed a solution later: the field has learnt since
+_DOUBT = 0.05  # rays of full white that say as much as is known before: that photos are exposed alike
 _SHARED = 3  # photos of one camera from which its vignetting can be told from theirs
 
 
 class ExposureFit:
-    """Natural gradient descent on three logarithms a photo and three numbers a camera.
+    """Least squares of three logarithms a photo and three numbers a camera, over what rays told lately.
 
     The photos' logarithms have the mean 0 in every channel, so that the field's colours are those of a photo of mean
     exposure.
     """
 
-    def __init__(self, frames: Sequence[Frame], cells: int) -> None:
+    def __init__(self, frames: Sequence[Frame], places: int) -> None:
+        """``places``: K, where rays may end."""
         self._cameras = list(dict.fromkeys(f.camera for f in frames))
         self.camera_of = torch.tensor([self._cameras.index(f.camera) for f in frames])
         """(F,)"""
         self.log_gains = torch.zeros(len(frames), 3)
         self.vignetting = torch.zeros(len(self._cameras), 3)
-        self._cells = torch.zeros(cells + 1, 2, 3)  # where rays end: their errors, their curvature
-        self._curvature = torch.zeros(len(frames), 3)
-        self._bend = torch.zeros(len(self._cameras), 3, 3)
-        self._photos = torch.bincount(self.camera_of)
-        self._shared = self._photos >= _SHARED
+        self._shared = torch.bincount(self.camera_of) >= _SHARED
+        # of each photo at each place: weight of its rays, and that times their basis; their errors
+        self._weights, self._slopes = torch.zeros(len(frames), places, 4), torch.zeros(len(frames), places, 3)
+        # of each camera: weight of its rays times their basis squared; errors times basis
+        self._bend, self._pull = torch.zeros(2, len(self._cameras), 3, 3)
+        self._steps = 0
 
     def gains(self, owner: Tensor, basis: Tensor) -> Tensor:
         """By how much photos differ from neutral: of photos (N,) at pixels whose `vignetting_basis` is (N, 3)."""
         fallen = (self.vignetting[self.camera_of[owner]] * basis).sum(-1, keepdim=True)
         return (self.log_gains[owner] + fallen).exp()
 
-    def learn(self, owner: Tensor, basis: Tensor, seen: Tensor, errors: Tensor, surface: Tensor, rate: float) -> None:
+    def learn(self, owner: Tensor, basis: Tensor, seen: Tensor, errors: Tensor, place: Tensor, rate: float) -> None:
         """Follow a step: what was seen in the photos' exposure and its error, (N, 3) each; where the rays end, (N,),
         -1: nowhere; ``rate`` in [0, 1]."""
-        errors = self._alone(seen, errors, surface)
-        self._follow_gains(owner, seen, errors, rate)
-        if bool(self._shared.any()):
-            self._follow_vignetting(owner, basis, seen, errors, rate)
+        ends = place >= 0
+        owner, basis, seen, errors, place = owner[ends], basis[ends], seen[ends], errors[ends], place[ends]
+        weight, slope = seen.square().mean(-1, keepdim=True), seen * errors
+        at, camera = owner * self._weights.shape[1] + place, self.camera_of[owner]
+        self._weights.view(-1, 4).index_add_(0, at, torch.cat([weight, weight * basis], -1))
+        self._slopes.view(-1, 3).index_add_(0, at, slope)
+        self._bend.index_add_(0, camera, (weight * basis)[:, :, None] * basis[:, None])
+        self._pull.index_add_(0, camera, basis[:, :, None] * slope[:, None])
+        self._steps += 1
+        if self._steps % _EVERY == 0:
+            self._follow(rate)
+            for told in (self._weights, self._slopes, self._bend, self._pull):
+                told *= _KEPT
 
-    def _alone(self, seen: Tensor, errors: Tensor, surface: Tensor) -> Tensor:
-        """Errors less what all photos have in common where rays end: that is the field's, which is still learning."""
-        place = surface + 1
-        cells = self._cells[place]
-        common = cells[:, 0] / (cells[:, 1] + _DOUBT)
-        self._cells *= _FADE
-        self._cells.index_add_(0, place, torch.stack([seen * errors, seen * seen], 1))
-        return errors - seen * common
-
-    def _follow_gains(self, owner: Tensor, seen: Tensor, errors: Tensor, rate: float) -> None:
-        slope = torch.zeros_like(self.log_gains).index_add_(0, owner, seen * errors)
-        now = torch.zeros_like(self.log_gains).index_add_(0, owner, seen * seen)
-        rays = torch.bincount(owner, minlength=len(self.log_gains))[:, None]
-        self._curvature = (1 - rays / _MEMORY).clamp_min(0) * self._curvature + now
-        self.log_gains -= rate * slope / (self._curvature + _DOUBT)
+    def _follow(self, rate: float) -> None:
+        """Go towards the solution, and bring what was told to where that leads."""
+        photos, normal, toward = len(self.log_gains), *self._equations()
+        # one vignetting for all channels: what their mean says
+        fallen = torch.linalg.solve(normal, toward).mean(-1)[photos:]
+        logs = torch.linalg.solve(
+            normal[:photos, :photos], toward[:photos] - normal[:photos, photos:] @ fallen[:, None]
+        )
+        logs, fallen = -rate * logs, -rate * fallen.view(-1, 3)
+        self.log_gains += logs
         self.log_gains -= self.log_gains.mean(0)
+        self.vignetting += fallen
+        moved = self._weights[..., 1:] @ fallen[self.camera_of][:, :, None] + self._weights[..., :1] * logs[:, None]
+        self._pull += (self._bend @ fallen[:, :, None]) + self._of_cameras(
+            self._weights[..., 1:].sum(1)[..., None] * logs[:, None]
+        )
+        self._slopes += moved
 
-    def _follow_vignetting(self, owner: Tensor, basis: Tensor, seen: Tensor, errors: Tensor, rate: float) -> None:
-        camera = self.camera_of[owner]
-        slope = torch.zeros_like(self.vignetting).index_add_(0, camera, (seen * errors).sum(-1, keepdim=True) * basis)
-        weight = (seen * seen).sum(-1)[:, None, None]
-        now = torch.zeros_like(self._bend).index_add_(0, camera, weight * basis[:, :, None] * basis[:, None])
-        rays = torch.bincount(camera, minlength=len(self.vignetting)) / self._photos
-        self._bend = (1 - rays / _MEMORY).clamp_min(0)[:, None, None] * self._bend + now
-        change = torch.linalg.solve(self._bend + _DOUBT * torch.eye(3), slope)
-        self.vignetting -= rate * change * self._shared[:, None]
+    def _equations(self) -> tuple[Tensor, Tensor]:
+        """Normal equations of gains and vignetting, (F + 3 C, F + 3 C), and what stands on their right in every
+        channel, (F + 3 C, 3); the places' own colours are eliminated."""
+        used = self._weights[..., 0].sum(0) > 0
+        weights, slopes = self._weights[:, used], self._slopes[:, used]
+        photos, cameras = len(self.log_gains), len(self.vignetting)
+        fallen = self._of_cameras(weights[..., 1:]).transpose(1, 2).reshape(3 * cameras, -1)
+        rows = torch.cat([weights[..., 0], fallen])
+        whole = torch.zeros(len(rows), len(rows))
+        whole[:photos, :photos] = weights[..., 0].sum(1).diag()
+        of = torch.nn.functional.one_hot(self.camera_of, cameras).float()
+        mixed = (of[:, :, None] * weights[..., 1:].sum(1)[:, None]).reshape(photos, -1)
+        whole[:photos, photos:], whole[photos:, :photos] = mixed, mixed.T
+        whole[photos:, photos:] = torch.block_diag(*self._bend)
+        shares = rows / (weights[..., 0].sum(0) + _DOUBT)
+        normal = whole - rows @ shares.T + _DOUBT * torch.eye(len(rows))
+        alone = (~self._shared).repeat_interleave(3).nonzero()[:, 0] + photos
+        normal[alone], normal[:, alone] = 0.0, 0.0
+        normal[alone, alone] = 1.0
+        at = torch.cat([self.log_gains, self.vignetting.view(-1, 1).expand(-1, 3)])
+        toward = torch.cat([slopes.sum(1), self._pull.reshape(-1, 3)]) - shares @ slopes.sum(0) + _DOUBT * at
+        toward[alone] = 0.0
+        return normal, toward
+
+    def _of_cameras(self, values: Tensor) -> Tensor:
+        """Sums over each camera's photos: (F, ...) -> (C, ...)."""
+        return values.new_zeros(len(self.vignetting), *values.shape[1:]).index_add_(0, self.camera_of, values)
 
     def of_camera(self, camera: Camera) -> tuple[float, float, float]:
         """`Exposure.vignetting` of a camera; of one that took none of the photos, none."""

@@ -23,7 +23,7 @@ from refield.scene.capture import Capture, Frame
 from refield.scene.exposure import Exposure
 
 _EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.1, 0.25, 0.1  # of a fit: what is asked of it must be there first
-_COARSE = 4  # cells of the occupancy grid are one place where rays end, a side
+_PLACES = 16  # where rays end, a side of the contracted cube
 _MOVING = 4  # every so-many-th ray tells how poses are wrong
 
 
@@ -57,13 +57,19 @@ class PhotoModel:
         frames = bank.frames
         distance = torch.stack([f.centre.float() - sampler.contraction.centre for f in frames]).norm(dim=-1).median()
         self._side = sampler.resolution
-        places = (-(-self._side // _COARSE)) ** 3
+        self._across = min(_PLACES, self._side)
+        places = self._across**3
         self.exposures = ExposureFit(frames, places) if config.exposures else None
         self.exposing = False
         """whether they are heeded; set by the fit, which knows photos that are left out"""
         self._asked_whether = False
         self.poses = PoseFit(frames, float(distance)) if config.poses else None
         self.trust = PhotoTrust(bank, places) if config.trust else None
+
+    @property
+    def unlike(self) -> bool:
+        """Whether the photos may have been exposed differently, for all that is known."""
+        return self.exposures is not None and (self.exposing or not self._asked_whether)
 
     def may_expose(self, progress: float) -> bool:
         """Whether now, once in a fit, is to be found out if the photos' exposures differ at all: gains of photos that
@@ -113,8 +119,8 @@ class PhotoModel:
         if not len(done.cells):
             return torch.full_like(done.heaviest, -1)
         cell, side = done.cells[done.heaviest.clamp_min(0)], self._side
-        i, j, k = (x // _COARSE for x in (cell // (side * side), cell // side % side, cell % side))
-        across = -(-side // _COARSE)
+        across = self._across
+        i, j, k = (x * across // side for x in (cell // (side * side), cell // side % side, cell % side))
         return torch.where(done.heaviest >= 0, (i * across + j) * across + k, -1)
 
     def inform(self, judge: HeldOut) -> None:

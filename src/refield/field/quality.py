@@ -59,7 +59,7 @@ def sized(config: FitConfig, frames: Sequence[Frame], quality: Quality) -> FitCo
         max_seconds=effort.seconds,
         samples=samples,
         field=_with(config.field, shape),
-        photos=_with(config.photos, PhotoModelConfig(exposures=True)),
+        photos=_with(config.photos, PhotoModelConfig(exposures=True, poses=True)),
     )
     return _with(config, chosen)
 

@@ -43,7 +43,7 @@ def refined(capture: Capture, path: Path) -> Capture:
         raise InputError(path, "holds no frames", "train again")
     try:
         frames = tuple(_refined(f, entries[f.name]) if f.name in entries else f for f in capture.frames)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise InputError(path, f"does not describe the photos ({error})", "train again") from None
     return replace(capture, frames=frames)
 
@@ -60,11 +60,17 @@ def _entry(given: Frame, found: Frame) -> dict[str, Any]:
 
 
 def _refined(frame: Frame, entry: dict[str, Any]) -> Frame:
+    if not isinstance(entry, dict):
+        raise ValueError(f"{frame.name} is not described by names")
     pose, camera, exposure = frame.world_from_cam, frame.camera, frame.exposure
     if "world_from_cam" in entry:
         pose = torch.tensor(entry["world_from_cam"], dtype=torch.float64).reshape(4, 4)
+        if not bool(pose.isfinite().all()):
+            raise ValueError(f"{frame.name} is nowhere")
     if "camera" in entry:
         camera = Camera(**entry["camera"])
+        if not all(isinstance(v, int | float) and math.isfinite(v) for v in asdict(camera).values()):
+            raise ValueError(f"the lens of {frame.name} is not described by numbers")
         if (camera.width, camera.height) != (frame.camera.width, frame.camera.height):
             raise ValueError(f"{frame.name} is of another size")
     if "exposure" in entry:
