@@ -63,6 +63,9 @@ class Photos:
         return HeldOut(self.held_out, masks=self.judged)
 
 
+_CLEARLY = 0.5  # dB: what exposures that were taken for others than they are may cost
+
+
 class HeldOut:
     """Fixed pixels of photos that training never sees."""
 
@@ -109,11 +112,11 @@ class HeldOut:
         return self._psnr_of(self._exposed(rgb), ~self.left) if exposed else self._psnr_of(rgb, None)
 
     def tells_exposures(self, model: Field) -> bool:
-        """Whether the photos' right halves come out better for exposures that their left halves tell."""
+        """Whether the photos' right halves come out clearly better for exposures that their left halves tell."""
         if self.rays is None:
             return False
         rgb, right = self._shown(model), ~self.left
-        return self._psnr_of(self._exposed(rgb), right) > self._psnr_of(rgb, right)
+        return self._psnr_of(self._exposed(rgb), right) > self._psnr_of(rgb, right) + _CLEARLY
 
     def _exposed(self, rgb: Tensor) -> Tensor:
         return (rgb * self._gains(rgb, self.left)[self.owner]).clamp(0, 1)
