@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from refield.field import kernels
+from refield.field.compiling import Compiling, compiling
 from refield.field.coverage import knowable
 from refield.field.encoding import Contraction, large_zeros
 from refield.field.kernels.reference import Aim
@@ -32,7 +33,8 @@ class FitConfig:
     steps: int = 2000
     """of gradient descent"""
     max_seconds: float | None = None
-    """stop in time: the learning rate follows whichever of steps and seconds is further on"""
+    """stop in time: the learning rate follows whichever of steps and seconds is further on; compiling, once on a machine,
+    is not counted"""
     samples: int = 8192
     """a step; the rays follow from how many samples each needs, and behind the first surface it needs none"""
     samples_per_ray: float = 40
@@ -53,6 +55,9 @@ class FitConfig:
     """choose ``field.finest`` from the photos' resolution"""
     check_every: int = 250
     """steps between looks at the held-out pixels"""
+    sharpen: bool = False
+    """leave out, in training, the parts of cells that are no more than haze: surfaces become sharp and rays short. Of
+    few or small photos it makes a field that knows them by heart"""
     patience: int = 4
     """looks without ``least_gain`` after which training stops"""
     least_gain: float = 0.02
@@ -322,6 +327,7 @@ class _Fit:
         self.rays_per_step = 512
         self.samples_per_ray = config.samples / 512
         self.began = time.perf_counter() if began is None else began
+        self.compiling = Compiling()
         self.loss = math.nan
         self.first: tuple[float, float] | None = None  # at the first step that `_stuck` asks
         self.rays_done, self.steps_done = 0, 0
@@ -332,7 +338,8 @@ class _Fit:
         """Raises _StuckError early on if the fit leads nowhere and ``may_give_up``."""
         self.model.train()
         try:
-            self._steps(may_give_up)
+            with compiling() as self.compiling:
+                self._steps(may_give_up)
         except NonFiniteError:
             self.occupancy.settle(self.pixels)
             raise
@@ -343,14 +350,18 @@ class _Fit:
     def _steps(self, may_give_up: bool) -> None:
         looks: list[float] = []
         for step in range(self.config.steps):
-            progress = progress_of(self.config, step, self.began)
+            progress = progress_of(self.config, step, self.began + self.compiling.seconds)
             if progress >= 1:
                 break
             self._step(step, progress)
             self.steps_done = step + 1
             if self.on_step:
                 self.on_step(step + 1, self.model)
-            if may_give_up and self._stuck() and progress_of(self.config, 0, self.began) < _LATE:
+            if (
+                may_give_up
+                and self._stuck()
+                and progress_of(self.config, 0, self.began + self.compiling.seconds) < _LATE
+            ):
                 raise _StuckError
             if (step + 1) % self.config.check_every == 0:
                 looks.append(self._look(step + 1))
@@ -387,7 +398,8 @@ class _Fit:
             self.adam.grads[_COLOUR_IN][:, -_DIRECTED:] = 0
         if self.adam.step(self.config.rate * rate, done.loss):
             self.loss = done.loss if math.isnan(self.loss) else self.loss + 0.03 * (done.loss - self.loss)
-            self.occupancy.observe(step, done.cells, done.weights, done.sigmas, done.parts)
+            parts = done.parts if self.config.sharpen else None
+            self.occupancy.observe(step, done.cells, done.weights, done.sigmas, parts)
             self.photos.learn(asked, done, progress, rate)
         self._resize(n, len(done.weights))
 
@@ -414,7 +426,8 @@ class _Fit:
         self.model.train()
         if self.on_progress:
             seconds = time.perf_counter() - self.began
-            left = seconds * (1 / max(progress_of(self.config, step, self.began), 1e-6) - 1)
+            counted = seconds - self.compiling.seconds
+            left = counted * (1 / max(progress_of(self.config, step, self.began + self.compiling.seconds), 1e-6) - 1)
             self.on_progress(
                 FitProgress(
                     step,

@@ -58,6 +58,7 @@ def sized(config: FitConfig, frames: Sequence[Frame], quality: Quality) -> FitCo
         steps=round(steps),
         max_seconds=effort.seconds,
         samples=samples,
+        sharpen=large,
         field=_with(config.field, shape),
         photos=_with(config.photos, PhotoModelConfig(exposures=True, poses=True)),
     )
