@@ -12,7 +12,7 @@ from numba.core import event
 _KIND = "numba:compile"
 
 
-class Compiling(event.Listener):  # type: ignore[misc]
+class Compiling(event.Listener):
     """Adds up the time in which something is compiled, one within the other counted once."""
 
     def __init__(self) -> None:

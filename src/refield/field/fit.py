@@ -33,8 +33,7 @@ class FitConfig:
     steps: int = 2000
     """of gradient descent"""
     max_seconds: float | None = None
-    """stop in time: the learning rate follows whichever of steps and seconds is further on; compiling, once on a machine,
-    is not counted"""
+    """stop in time: the learning rate follows whichever of steps and seconds is further on; compiling is not counted"""
     samples: int = 8192
     """a step; the rays follow from how many samples each needs, and behind the first surface it needs none"""
     samples_per_ray: float = 40
@@ -350,23 +349,22 @@ class _Fit:
     def _steps(self, may_give_up: bool) -> None:
         looks: list[float] = []
         for step in range(self.config.steps):
-            progress = progress_of(self.config, step, self.began + self.compiling.seconds)
+            progress = self._progress(step)
             if progress >= 1:
                 break
             self._step(step, progress)
             self.steps_done = step + 1
             if self.on_step:
                 self.on_step(step + 1, self.model)
-            if (
-                may_give_up
-                and self._stuck()
-                and progress_of(self.config, 0, self.began + self.compiling.seconds) < _LATE
-            ):
+            if may_give_up and self._stuck() and self._progress(0) < _LATE:
                 raise _StuckError
             if (step + 1) % self.config.check_every == 0:
                 looks.append(self._look(step + 1))
                 if at_plateau(looks, self.config):
                     break
+
+    def _progress(self, step: int) -> float:
+        return progress_of(self.config, step, self.began + self.compiling.seconds)
 
     def _stuck(self) -> bool:
         """Whether, by the second step, the photos that teach have been learnt by heart; known only if some are left
@@ -427,7 +425,7 @@ class _Fit:
         if self.on_progress:
             seconds = time.perf_counter() - self.began
             counted = seconds - self.compiling.seconds
-            left = counted * (1 / max(progress_of(self.config, step, self.began + self.compiling.seconds), 1e-6) - 1)
+            left = counted * (1 / max(self._progress(step), 1e-6) - 1)
             self.on_progress(
                 FitProgress(
                     step,
