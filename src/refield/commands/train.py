@@ -14,7 +14,7 @@ from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig, fit_nerfacto
 from refield.field.memory import Memory, memory_fault, memory_of
 from refield.field.nerfacto import NerfactoField
 from refield.field.photo_size import sizes_told
-from refield.field.quality import Quality, sized
+from refield.field.quality import OPEN, Quality, sized
 from refield.field.radiance import HashField
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
 from refield.photos.landmarks import Landmarks, write_landmarks
@@ -36,7 +36,7 @@ class Train:
     """the workspace to make"""
     quality: Quality = "good"
     """draft takes a minute at most, good some minutes, best some tens of minutes: on two cores, and of large captures;
-    small ones take less. What ``fit`` options say goes before it"""
+    small ones take less. What ``fit`` options say goes before it; a 0 there leaves it to the quality"""
     more: bool = False
     """go on with the fit of a workspace, given in place of DATA, from where it stood"""
     overwrite: bool = False
@@ -48,7 +48,7 @@ class Train:
     architecture: Literal["hash", "nerfacto", "nerfacto-reduced"] = "hash"
     """of the field: hash, which fits on a CPU in less than a minute; NeRFacto's, for long fits; or that one reduced to
     what a CPU can train in minutes, which heeds no ``nerfacto`` option but the time limit and the seed"""
-    fit: FitConfig = field(default_factory=FitConfig)
+    fit: FitConfig = OPEN
     nerfacto: NerfactoFitConfig = field(default_factory=NerfactoFitConfig)
 
 

@@ -54,9 +54,9 @@ class FitConfig:
     """choose ``field.finest`` from the photos' resolution"""
     check_every: int = 250
     """steps between looks at the held-out pixels"""
-    sharpen: bool = False
+    sharpen: bool | None = None
     """leave out, in training, the parts of cells that are no more than haze: surfaces become sharp and rays short. Of
-    few or small photos it makes a field that knows them by heart"""
+    few or small photos it makes a field that knows them by heart; by default as the quality says, not without one"""
     patience: int = 4
     """looks without ``least_gain`` after which training stops"""
     least_gain: float = 0.02

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Literal, TypeVar
 
 from refield.field.fit import FitConfig
 from refield.field.photo_model import PhotoModelConfig
@@ -16,6 +16,7 @@ from refield.field.radiance import HashFieldConfig
 from refield.scene.capture import Frame
 
 Quality = Literal["draft", "good", "best"]
+_Part = TypeVar("_Part", HashFieldConfig, PhotoModelConfig)
 
 
 @dataclass(frozen=True)
@@ -39,36 +40,42 @@ _PIXELS_PER_ENTRY = 60
 _GROWTH = 1.5  # from level to level
 
 
+OPEN = FitConfig(steps=0, samples=0, field=HashFieldConfig(levels=0, log2_table=0, width=0))
+"""What a quality is to decide: numbers that are 0, and what is None"""
+
+
 def sized(config: FitConfig, frames: Sequence[Frame], quality: Quality) -> FitConfig:
-    """The config with what a quality says for the training frames, wherever it is the default's."""
-    pixels, effort = sum(f.camera.width * f.camera.height for f in frames), _EFFORTS[quality]
-    usual = FitConfig()
-    log2 = round(math.log2(max(pixels, 1) / _PIXELS_PER_ENTRY))
-    log2 = int(min(max(log2, usual.field.log2_table), effort.largest_table))
+    """The config with what a quality says for the training frames, wherever it leaves that open, see `OPEN`."""
+    pixels, effort, usual = sum(f.camera.width * f.camera.height for f in frames), _EFFORTS[quality], FitConfig()
+    log2 = config.field.log2_table or _log2_table(pixels, effort)
     large = log2 > usual.field.log2_table
-    finest = round(2.5 * 2 ** (log2 / 2))
+    finest = 2.5 * 2 ** (log2 / 2)  # see `fit._finest_for`
     shape = HashFieldConfig(
         levels=max(round(1 + math.log(finest / usual.field.coarsest) / math.log(_GROWTH)), usual.field.levels),
         log2_table=log2,
         width=64 if large else usual.field.width,
     )
-    samples = 2 * usual.samples if large else usual.samples
+    samples = config.samples or (2 * usual.samples if large else usual.samples)
     steps = max(usual.steps * usual.samples, effort.samples_per_pixel * pixels) / samples
-    chosen = FitConfig(
-        steps=round(steps),
-        max_seconds=effort.seconds,
+    return replace(
+        config,
+        steps=config.steps or round(steps),
+        max_seconds=config.max_seconds or effort.seconds,
         samples=samples,
-        sharpen=large,
+        sharpen=large if config.sharpen is None else config.sharpen,
         field=_with(config.field, shape),
         photos=_with(config.photos, PhotoModelConfig(exposures=True, poses=True)),
     )
-    return _with(config, chosen)
 
 
-def _with(given: Any, chosen: Any) -> Any:
-    """A config with what was chosen for those of its numbers that are the default's."""
-    usual = type(given)()
-    other = {f.name for f in fields(given) if getattr(given, f.name) != getattr(usual, f.name)}
-    kept = {f.name: getattr(chosen, f.name) for f in fields(given) if f.name not in other}
-    own = {name: getattr(chosen, name) for name in other if name in ("field", "photos")}  # merged already
-    return replace(given, **kept, **own)
+def _log2_table(pixels: int, effort: _Effort) -> int:
+    least = FitConfig().field.log2_table
+    return int(min(max(round(math.log2(max(pixels, 1) / _PIXELS_PER_ENTRY)), least), effort.largest_table))
+
+
+def _with(given: _Part, chosen: _Part) -> _Part:
+    """A config with what was chosen for what it leaves open."""
+    said = {f.name: getattr(given, f.name) for f in fields(given)}
+    return replace(
+        chosen, **{name: value for name, value in said.items() if value is not None and (value is False or value != 0)}
+    )
