@@ -2,6 +2,8 @@
 
     python benchmarks/gauntlet.py --seeds 0..39 --jobs 2            # random worlds (developing: 0 to 999)
     python benchmarks/gauntlet.py --seeds 1000..1199 --jobs 2       # to report on; a second time only with --again
+    python benchmarks/gauntlet.py --seeds 2000..2039                # every kind of capture; to report on: 3000 to 3999
+    python benchmarks/gauntlet.py --seeds 0..9 --synth "--path walk --mixed --photos 200" --out build/walk
     python benchmarks/gauntlet.py --worlds cube added --synth "--size 96 --cameras 40 --spp 16"
     python benchmarks/gauntlet.py --real --data ../shared/data      # real photographs; with --seeds, changes in them
 

@@ -228,8 +228,8 @@ def test_a_fit_that_breaks_down_keeps_its_last_good_state_and_says_so(place, mon
 
     whole, steps = kernels.train_step, []
 
-    def step(*args):
-        steps.append(whole(*args))
+    def step(*args, **more):
+        steps.append(whole(*args, **more))
         return steps[-1] if len(steps) < 20 else steps[-1]._replace(loss=float("nan"))
 
     monkeypatch.setattr(kernels, "train_step", step)

@@ -91,7 +91,7 @@ def test_a_seed_is_reported_on_once(part, tmp_path: Path) -> None:
         ledger(path).claim([999, 1000], again=False)
     ledger(path).claim([1000], again=True)
     with pytest.raises(InputError, match="neither for developing"):
-        ledger(path).claim([2000], again=True)
+        ledger(path).claim([4000], again=True)
     assert ledger(path).runs == {3: 2, 1000: 2}
     ledger(path, "rehearsals").claim([1000], again=False)
     assert ledger(path).runs == {3: 2, 1000: 2} and ledger(path, "rehearsals").runs == {1000: 1}

@@ -9,8 +9,16 @@ from typing import Literal
 from refield.scene.errors import InputError
 from refield.scene.files import read_json, write_json
 
-DEVELOPING, REPORTING = range(0, 1000), range(1000, 2000)
-_PURPOSES = {"developing": DEVELOPING, "reporting": REPORTING}
+_PURPOSES = {
+    "developing": (range(0, 1000), range(2000, 3000)),
+    "reporting": (range(1000, 2000), range(3000, 4000)),
+}
+"""From 2000 on random worlds are of every kind of capture."""
+
+
+def is_for(purpose: str, seed: int) -> bool:
+    """Whether a seed is for ``developing`` or for ``reporting``."""
+    return any(seed in part for part in _PURPOSES[purpose])
 
 
 class Ledger:
@@ -27,11 +35,11 @@ class Ledger:
         Raises:
             InputError: a seed belongs to neither range, or was reported on before and not ``again``.
         """
-        outside = [s for s in seeds if not any(s in r for r in _PURPOSES.values())]
+        outside = [s for s in seeds if not any(is_for(purpose, s) for purpose in _PURPOSES)]
         if outside:
-            what = f"{outside[0]} is neither for developing (0 to 999) nor for reporting (1000 to 1999)"
+            what = f"{outside[0]} is neither for developing (0 to 999, from 2000) nor for reporting (from 1000, 3000)"
             raise InputError("--seeds", what, "choose others")
-        used = [s for s in seeds if s in REPORTING and self.runs.get(s)]
+        used = [s for s in seeds if is_for("reporting", s) and self.runs.get(s)]
         if used and not again:
             what = f"{len(used)} of them were reported on before ({used[0]} {self.runs[used[0]]} times)"
             raise InputError("--seeds", what, "choose fresh ones, or pass --again, which the table will tell")
@@ -43,8 +51,8 @@ class Ledger:
     def told(self, seeds: Sequence[int]) -> str:
         """One line for a table: what the seeds are for, and how often they ran."""
         parts = []
-        for purpose, within in _PURPOSES.items():
-            mine = [self.runs.get(s, 0) for s in seeds if s in within]
+        for purpose in _PURPOSES:
+            mine = [self.runs.get(s, 0) for s in seeds if is_for(purpose, s)]
             if mine:
                 often = f"{min(mine)}" if min(mine) == max(mine) else f"{min(mine)} to {max(mine)}"
                 parts.append(f"{len(mine)} seeds for {purpose}, each run {often} time{'s' if max(mine) != 1 else ''}")

@@ -79,7 +79,9 @@ def retouched(capture: Capture, now: Field, folder: Path) -> Capture:
     before = updates[-1].pretrained
 
     def one(frame: Frame, name: str) -> Frame:
-        return replace(frame, path=folder / name, made=_Retouched(frame, before, now, shapes, lights))
+        # what is written is neutral already
+        made = _Retouched(frame, before, now, shapes, lights)
+        return replace(frame, path=folder / name, exposure=None, made=made)
 
     return replace(capture, frames=tuple(one(f, f"{i:04d}.png") for i, f in enumerate(capture.frames)))
 

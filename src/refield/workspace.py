@@ -199,8 +199,11 @@ class Workspace:
 
     def capture(self) -> Capture:
         """The photos that the field was fitted to, with what the fit found out about them."""
-        given = load_transforms(self.path / "capture", decode=False)
-        return refined(given, self.path / "capture" / REFINED)
+        return refined(self.given_capture(), self.path / "capture" / REFINED)
+
+    def given_capture(self) -> Capture:
+        """The photos that the field was fitted to, as they were given."""
+        return load_transforms(self.path / "capture", decode=False)
 
     def keep_refined(self, given: Capture, found: Capture) -> None:
         """Note what the fit found out about the photos of the capture kept here, see `refield.scene.refined`."""
@@ -211,6 +214,11 @@ class Workspace:
         tensors, facts = field.state()
         facts["held_out_psnr"] = psnr if math.isfinite(psnr) else None
         write_tensors(self.path / "field", tensors, facts)
+
+    def held_out_psnr(self) -> float:
+        """Of the field before any visit, dB; NaN if it is not known."""
+        known = read_json(self.path / "field" / "field.json").get("held_out_psnr")
+        return float(known) if isinstance(known, int | float) else math.nan
 
     def field(self) -> HashField | NerfactoField:
         """The field before any visit, of either architecture."""

@@ -222,13 +222,13 @@ def broken(monkeypatch: pytest.MonkeyPatch, bad: Callable[[int], bool], gradient
     """Make the loss, or one of its gradients, NaN in chosen steps; the list holds the steps taken."""
     whole, steps = kernels.train_step, []
 
-    def step(*args):  # type: ignore[no-untyped-def]
-        done = whole(*args)
+    def step(*args, **more):  # type: ignore[no-untyped-def]
+        done = whole(*args, **more)
         steps.append(len(steps))
         if not bad(steps[-1]):
             return done
         if gradient:
-            args[-1][3][0, 0] = math.nan
+            args[6][3][0, 0] = math.nan
             return done
         return done._replace(loss=math.nan)
 

@@ -232,16 +232,24 @@ def moved(x: object) -> object:
     return x.to(DEVICE) if isinstance(x, Tensor) else x
 
 
+def some_masks(side: int) -> Tensor:
+    """Of some cells nothing finer is known, of others a part of their parts is full."""
+    bits = torch.rand(side, side, side, 64) < torch.rand(side, side, side, 1) * 0.5
+    return torch.where(torch.rand(side, side, side) < 0.3, 0, (bits.long() << torch.arange(64)).sum(-1))
+
+
 @pytest.mark.parametrize("fill", [0.0, 0.05, 1.0])
 @pytest.mark.parametrize("visible", [False, True])
-def test_march(fill: float, visible: bool) -> None:
+@pytest.mark.parametrize("masked", [False, True])
+def test_march(fill: float, visible: bool, masked: bool) -> None:
     asked = question(fill)
+    fine = some_masks(len(asked[2])) if masked else None
     if visible:
-        truth = reference.march_visible(*asked, density_net(), 7.0)
-        fast = gpu.march_visible(*moved(asked), moved(density_net()), 7.0)
-        assert len(truth[0]) < len(reference.march(*asked)[0]) or fill < 1
+        truth = reference.march_visible(*asked, density_net(), 7.0, fine)
+        fast = gpu.march_visible(*moved(asked), moved(density_net()), 7.0, moved(fine))
+        assert len(truth[0]) < len(reference.march(*asked, fine)[0]) or fill < 1
     else:
-        truth, fast = reference.march(*asked), gpu.march(*moved(asked))
+        truth, fast = reference.march(*asked, fine), gpu.march(*moved(asked), moved(fine))
     fast = tuple(x.cpu() for x in fast)
     # a midpoint on a cell's face may fall either way after a long sum of float32 steps
     difference = (fast[2].diff() - truth[2].diff()).abs()

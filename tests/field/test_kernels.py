@@ -92,11 +92,20 @@ def test_distortion_against_the_double_sum() -> None:
     torch.testing.assert_close(results[1][0][5], direct, rtol=1e-3, atol=1e-6)
 
 
+def some_masks(side: int) -> torch.Tensor:
+    """(side, side, side) int64: of some cells nothing finer is known, of others a part of their parts is full."""
+    bits = torch.rand(side, side, side, 64) < torch.rand(side, side, side, 1) * 0.5
+    masks = (bits.long() << torch.arange(64)).sum(-1)
+    return torch.where(torch.rand(side, side, side) < 0.3, 0, masks)
+
+
 @pytest.mark.parametrize("fill", [0.0, 0.05, 0.5, 1.0])
 @pytest.mark.parametrize("visible", [False, True])
-def test_march(fill: float, visible: bool) -> None:
+@pytest.mark.parametrize("masked", [False, True])
+def test_march(fill: float, visible: bool, masked: bool) -> None:
     torch.manual_seed(5)
     grid = (torch.rand(32, 32, 32) < fill).to(torch.uint8)
+    fine = some_masks(32) if masked else None
     origins = torch.randn(200, 3) * 2
     directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
     directions[0], directions[1] = torch.tensor([1.0, 0, 0]), torch.tensor([0, 0, -1.0])
@@ -104,10 +113,10 @@ def test_march(fill: float, visible: bool) -> None:
     rays = (origins, directions, torch.rand(200))
     if visible:
         net = (torch.randn(3, 1 << 12, 2), (8, 16, 64), torch.randn(32, 6), torch.randn(32) * 0.1)
-        truth, fast = (twin.march_visible(rays, space, grid, lattice, net, 7.0) for twin in (reference, cpu))
-        assert len(truth[0]) < len(reference.march(rays, space, grid, lattice)[0]) or fill == 0
+        truth, fast = (twin.march_visible(rays, space, grid, lattice, net, 7.0, fine) for twin in (reference, cpu))
+        assert len(truth[0]) < len(reference.march(rays, space, grid, lattice, fine)[0]) or fill == 0
     else:
-        truth, fast = (twin.march(rays, space, grid, lattice) for twin in (reference, cpu))
+        truth, fast = (twin.march(rays, space, grid, lattice, fine) for twin in (reference, cpu))
     # a midpoint on a cell's face may fall either way after a long sum of float32 steps
     difference = (fast[2].diff() - truth[2].diff()).abs()
     assert difference.max() <= 2
@@ -210,13 +219,30 @@ def test_train_step(fill: float, scale: float, rays: int) -> None:
     assert difference.abs().sum() <= 4 + 0.01 * len(truth.cells)
     for mine, true in zip((*grads, fast.shown, fast.errors), (*true_grads, truth.shown, truth.errors)):
         assert (mine - true).norm() <= 1e-2 * true.norm()
-    assert (fast.weights[fast.heaviest] - truth.weights[truth.heaviest]).abs().median() < 1e-5 if len(fast.weights) else (
-        fast.heaviest.eq(-1).all() and truth.heaviest.eq(-1).all()
+    assert (
+        (fast.weights[fast.heaviest] - truth.weights[truth.heaviest]).abs().median() < 1e-5
+        if len(fast.weights)
+        else (fast.heaviest.eq(-1).all() and truth.heaviest.eq(-1).all())
     )
     for mine, true in zip(fast.to_rays, truth.to_rays):
         # where a sample fell to the other side of a cell's border its slope is another's
         off = (mine - true).norm(dim=-1) > 1e-2 * true.norm(dim=-1) + 1e-4 * true.norm()
         assert mine.shape == (rays // 2, 3) and off.float().mean() < 0.03
+
+
+@pytest.mark.parametrize("fill, rays", [(0.05, 700), (1.0, 257), (0.0, 20), (0.3, 0)])
+def test_render(fill: float, rays: int) -> None:
+    torch.manual_seed(8)
+    nets, tables = networks(4, 16, 7), torch.randn(4, 1 << 12, 2)
+    origins = torch.nn.functional.normalize(torch.randn(rays, 3), dim=-1) * 3
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3) * 0.5 - origins, dim=-1)
+    grid = (torch.rand(32, 32, 32) < fill).to(torch.uint8)
+    place = ((origins, directions, torch.zeros(rays)), (torch.tensor([0.1, 0.0, 0.2]), 1.5), grid, (0.0, 60.0, 0.05))
+    field = (tables, geometric_levels(8, 64, 4), nets)
+    for fast, truth in zip(cpu.render(*place, field, 7.0), reference.render(*place, field, 7.0)):
+        assert fast.shape == truth.shape
+        off = (fast - truth).abs() > 1e-3 * (1 + truth.abs())
+        assert off.float().mean() < 0.01 if rays else off.numel() == 0  # a sample may fall to either side of a border
 
 
 def test_train_step_is_the_same_bit_for_bit_for_any_number_of_threads() -> None:
@@ -342,11 +368,11 @@ def test_what_cells_are_known_to_hold() -> None:
 
 @pytest.mark.parametrize("side", [16, 18])
 def test_reach_never_passes_over_what_is_there(side: int) -> None:
-    from refield.field.kernels.cpu import marching
+    from refield.field.kernels.cpu import cells
 
     torch.manual_seed(12)
     grid = (torch.rand(side, side, side) < 2e-3).to(torch.uint8)
-    found = marching.reach(grid)
+    found = cells.reach(grid)
     some = (
         torch.nn.functional.pad(grid, (0, -side % 4) * 3)
         .unfold(0, 4, 4)
@@ -359,4 +385,4 @@ def test_reach_never_passes_over_what_is_there(side: int) -> None:
         true = int((full - torch.tensor([i, j, k])).abs().amax(1).min())
         assert found[i, j, k] == min(true, 8)
     grid[0, 0, 0] = 1
-    assert marching.reach(grid)[0, 0, 0] == 0  # written to since
+    assert cells.reach(grid)[0, 0, 0] == 0  # written to since

@@ -107,7 +107,7 @@ def test_a_damaged_file_is_refused(given: Capture, tmp_path: Path) -> None:
     sound = json.loads(path.read_text())["frames"][name]
     for entry in broken(sound):
         path.write_text(json.dumps({"frames": {name: entry}}))
-        with pytest.raises(InputError, match="does not describe the photos|is not valid JSON"):
+        with pytest.raises(InputError, match=r"does not describe the photos|is not valid JSON"):
             refined(given, path)
     path.write_text('{"frames": 3}')
     with pytest.raises(InputError, match="holds no frames"):

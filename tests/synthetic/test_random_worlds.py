@@ -18,9 +18,10 @@ from refield.synthetic.disturb import Disturbance, disturbed_photo, falloff
 from refield.synthetic.random_objects import FAMILIES, drawn_item, random_item
 from refield.synthetic.random_paths import draw_camera, draw_path
 from refield.synthetic.random_places import Patch, draw_place
+from refield.synthetic.random_rounds import ROUNDS
 from refield.synthetic.random_scenes import draw_kinds
 from refield.synthetic.random_views import Views, differs
-from refield.synthetic.random_worlds import random_world
+from refield.synthetic.random_worlds import _every_kind, random_world
 from refield.synthetic.shapes import Box
 from refield.synthetic.state import Lamp
 from refield.synthetic.terrain import Terrain
@@ -177,6 +178,8 @@ def test_each_worlds_own_number_of_photos_is_asked_for(tmp_path):
         run(Synth("random", tmp_path / "x", config=SynthConfig(cameras=20)))
     with pytest.raises(InputError, match="give --cameras"):
         run(Synth("cube", tmp_path / "x", config=SynthConfig(photos=20)))
+    with pytest.raises(InputError, match="--path"):
+        run(Synth("cube", tmp_path / "x", config=SynthConfig(path="walk")))
     with pytest.raises(InputError, match="photos"):
         SynthConfig(photos=3)
     assert not (tmp_path / "x").exists()
@@ -212,3 +215,37 @@ def test_more_light_is_more_of_every_light(worlds):
     more = state.brightened(2.0)
     assert more.sun == (2.0, 4.0, 6.0) and more.lamps[0].light == (2.0, 2.0, 4.0)
     assert np.allclose(more.surroundings, 2 * state.surroundings)
+
+
+@pytest.mark.parametrize("path", ROUNDS)
+def test_a_world_can_be_photographed_from_within(path):
+    """Old photos look in all directions, the new ones at the objects."""
+    drawn = random_world(2, 40, path)
+    assert drawn.facts["path"] == path and drawn.facts["place"] == "around"
+    ways = torch.stack([pose[:2, 2] for pose in drawn.old])
+    sides = {(bool(x > 0), bool(y > 0)) for x, y in ways}
+    assert len(sides) == 4
+    for pose in (*drawn.new, *drawn.evaluation):
+        to = torch.nn.functional.normalize(torch.tensor(drawn.world.target).double() - pose[:3, 3], dim=0)
+        assert float(pose[:3, 2] @ to) > 0.9
+    out = torch.stack([pose[:2, 3] @ pose[:2, 2] / pose[:2, 3].norm() for pose in drawn.old])
+    assert (out > 0.8).all() if path == "inside-out" else (out < 0.8).all()
+
+
+def test_a_path_and_formats_can_be_asked_for_and_earlier_seeds_stay():
+    drawn = random_world(0, 30, "forward", mixed=True)
+    assert drawn.facts["path"] == "forward" and drawn.facts["portrait and landscape"]
+    cameras = drawn.cameras("before", 30)
+    sizes = {(c.width, c.height) for c in cameras}
+    assert sizes == {(drawn.camera.width, drawn.camera.height), (drawn.camera.height, drawn.camera.width)}
+    assert cameras == drawn.cameras("before", 30)
+    with pytest.raises(InputError, match="no such path"):
+        random_world(0, 30, "sideways")
+
+
+def test_later_seeds_draw_every_kind_of_capture():
+    kinds = [_every_kind(seed) for seed in range(2000, 2200)]
+    assert {path for path, _, _ in kinds} == {None, *ROUNDS}
+    assert 30 < sum(mixed for _, mixed, _ in kinds) < 100
+    counts = [count for _, _, count in kinds]
+    assert min(counts) >= 20 and max(counts) <= 300 and min(counts) < 30 and max(counts) > 200

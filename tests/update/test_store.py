@@ -74,3 +74,24 @@ def test_damage_is_named(tmp_path):
     write_tensors(tmp_path, {k: v for k, v in tensors.items() if k != "region.0.values"}, facts)
     with pytest.raises(InputError, match=r"region\.0\.values"):
         load_updated(tmp_path, old, change)
+
+
+def test_what_is_known_of_parts_of_cells_stays_where_nothing_changed(tmp_path):
+    old, change = small_field(0), a_change()
+    before = old.sampler.grid
+    masks = torch.randint(1, 1 << 62, before.shape, generator=torch.Generator().manual_seed(6))
+    old.looking_where(before, torch.where(before > 0, masks, 0))
+    field = UpdatedField(old, change, small_field(3))
+    kept = field.sampler.fine
+    near = torch.cat([old.sampler.cells_in(box) for box in field.boxes])
+    assert not kept.view(-1)[near].any()
+    far = torch.ones_like(before, dtype=torch.bool)
+    far.view(-1)[near] = False
+    assert far.any() and torch.equal(kept[far], old.sampler.fine[far])
+    save_updated(tmp_path, field)
+    back = load_updated(tmp_path, old, change).sampler
+    assert torch.equal(back.fine, torch.where(back.grid > 0, kept, 0))
+    tensors, facts = read_tensors(tmp_path)
+    write_tensors(tmp_path, tensors | {"parts": tensors["parts"][:-1]}, facts)
+    with pytest.raises(InputError, match="mask"):
+        load_updated(tmp_path, old, change)

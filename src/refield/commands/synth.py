@@ -19,6 +19,7 @@ from refield.synthetic.write import SynthConfig, write_world
 from refield.workspace import refuse_inside
 
 RANDOM = "random"
+_OF_RANDOM = {"photos": "give --cameras for {}", "path": "leave it out", "mixed": "leave it out"}
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,8 @@ def run(options: Synth) -> None:
             write_random(options.out, options.config, on_progress=count)
         else:
             told = asdict(options.config)
-            del told["photos"]
-            write_world(options.world, options.out, **told, on_progress=count)
+            named = {name: value for name, value in told.items() if name not in _OF_RANDOM}
+            write_world(options.world, options.out, **named, on_progress=count)
     clock.stop()
     print(f"{options.world} is in {options.out} ({clock.total:.0f} s)")
 
@@ -79,8 +80,9 @@ def _into(options: Synth, work: Path, clock: Clock) -> None:
 def _refuse_the_others_options(options: Synth) -> None:
     if options.world == RANDOM and options.config.cameras is not None:
         raise InputError("--cameras", "is for the worlds that have a name", "give --photos for the world random")
-    if options.world != RANDOM and options.config.photos is not None:
-        raise InputError("--photos", f"is for the world {RANDOM}", f"give --cameras for {options.world}")
+    for name, instead in _OF_RANDOM.items():
+        if options.world != RANDOM and getattr(options.config, name):
+            raise InputError(f"--{name}", f"is for the world {RANDOM}", instead.format(options.world))
 
 
 def _refuse_unless_free(out: Path, *, overwrite: bool) -> None:

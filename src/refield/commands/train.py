@@ -9,10 +9,12 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
-from refield.field.fit import FitConfig, NonFiniteError, ProgressCallback, fit_field
+from refield.field.fit import FitConfig, NonFiniteError, ProgressCallback, fit_capture
 from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig, fit_nerfacto
 from refield.field.memory import Memory, memory_fault, memory_of
 from refield.field.nerfacto import NerfactoField
+from refield.field.photo_size import sizes_told
+from refield.field.quality import Quality, sized
 from refield.field.radiance import HashField
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
 from refield.photos.landmarks import Landmarks, write_landmarks
@@ -30,8 +32,13 @@ class Train:
 
     data: Annotated[Path, arg(metavar="DATA"), Positional]
     """a folder of photos or videos, a transforms.json or its folder, or a COLMAP model in sparse/0 with images/"""
-    work: Annotated[Path, arg(metavar="WORK"), Positional]
+    work: Annotated[Path, arg(metavar="WORK"), Positional] = Path()
     """the workspace to make"""
+    quality: Quality = "good"
+    """draft takes a minute at most, good some minutes, best some tens of minutes: on two cores, and of large captures;
+    small ones take less. What ``fit`` options say goes before it"""
+    more: bool = False
+    """go on with the fit of a workspace, given in place of DATA, from where it stood"""
     overwrite: bool = False
     """replace the workspace that is there, with its visits"""
     scale: float | None = None
@@ -47,9 +54,15 @@ class Train:
 
 def run(options: Train) -> None:
     clock = Clock()
+    if options.more:
+        psnr = train_more(options.data, clock, options.fit, options.quality)
+        clock.console.print(f"The field is in {options.data} ({psnr:.2f} dB, {clock.total:.1f} s).", markup=False)
+        return
+    if options.work == Path():
+        raise InputError("WORK", "is not given", "name the folder in which to make the workspace")
     _check_scale(options.scale)
     task = Sources(options.data, options.work, options.poses, options.scale)
-    train(task, clock, _config_of(options), overwrite=options.overwrite)
+    train(task, clock, _config_of(options), overwrite=options.overwrite, quality=options.quality)
     clock.console.print(f"The field is in {options.work} ({clock.total:.1f} s).", markup=False)
 
 
@@ -72,9 +85,17 @@ class Sources:
 
 
 def train(
-    task: Sources, clock: Clock, config: FitConfig | NerfactoFitConfig, *, overwrite: bool, made_by: str = "train"
+    task: Sources,
+    clock: Clock,
+    config: FitConfig | NerfactoFitConfig,
+    *,
+    overwrite: bool,
+    made_by: str = "train",
+    quality: Quality | None = None,
 ) -> float:
     """Load, fit, keep. Returns the PSNR on held-out pixels, dB (NaN where none is held out).
+
+    A ``quality`` says what the default config leaves open, see `refield.field.quality`.
 
     Raises:
         InputError: as `load_capture`, `capture_from_photos` and `Workspace.building`, or the photos do not fit into
@@ -82,6 +103,8 @@ def train(
     """
     Workspace.refuse_unless_free(task.work, overwrite=overwrite)
     capture, landmarks = _loaded(task, clock)
+    if quality is not None and isinstance(config, FitConfig):
+        config = sized(config, capture.train, quality)
     needed = memory_of(capture, config)
     _check_memory(task.data, needed)
     _check_cameras(task.data, capture)
@@ -91,27 +114,73 @@ def train(
         if landmarks is not None:
             write_landmarks(workspace.landmarks, landmarks)
         clock.stage(f"fit a field to {len(capture.train)} photos")
-        clock.console.print(f"           memory: {needed}", markup=False)
+        _tell(capture, config, needed, clock)
         try:
             with clock.training("fit") as line:
-                fitted = _fitted(capture, config, line)
+                fitted, found = _fitted(capture, config, line)
         except NonFiniteError as error:
             if error.field is None or error.steps == 0:
                 raise
-            fitted = error.field
+            fitted, found = error.field, capture
             clock.warn(f"{error}; the last good state is kept, look at it before you use it")
         clock.stage("keep the field")
         workspace.keep_field(fitted, line.psnr)
+        workspace.keep_refined(capture, found)
     clock.stop()
     return line.psnr
 
 
+def train_more(work: Path, clock: Clock, config: FitConfig, quality: Quality) -> float:
+    """Go on with the fit of a workspace; the field that shows held-out photos better is kept. Returns its PSNR, dB.
+
+    Raises:
+        InputError: no workspace, one of another architecture, or one with visits, which stand on the field as it is.
+    """
+    workspace = Workspace.open(work)
+    if workspace.visits:
+        raise InputError(work, "has visits, which stand on its field as it is", "train a workspace of its own")
+    field, capture = workspace.field(), workspace.capture()
+    if not isinstance(field, HashField):
+        raise InputError(work, f"holds a field of the kind {type(field).__name__}", "train anew")
+    config = sized(config, capture.train, quality)
+    with workspace.writing():
+        clock.stage(f"go on with the fit to {len(capture.train)} photos")
+        _tell(capture, config, memory_of(capture, replace(config, field=field.config)), clock)
+        before = workspace.held_out_psnr()
+        with clock.training("fit") as line:
+            done = fit_capture(capture, config, line, start=field, goes_on=True)
+        if line.psnr < before:
+            clock.warn(
+                f"{line.psnr:.2f} dB on held-out photos is no better than the {before:.2f} of before, which stays"
+            )
+        else:
+            clock.stage("keep the field")
+            workspace.keep_field(done.field, line.psnr)
+            workspace.keep_refined(workspace.given_capture(), done.capture)
+    clock.stop()
+    return max(line.psnr, before) if before == before else line.psnr
+
+
+def _tell(capture: Capture, config: FitConfig | NerfactoFitConfig, needed: Memory, clock: Clock) -> None:
+    """What is known before it begins: sizes, memory, time."""
+    told = [f"memory: {needed}"]
+    if isinstance(config, FitConfig):
+        told.insert(0, sizes_told(capture, config.size) or "")
+        most = "" if config.max_seconds is None else f", {config.max_seconds:.0f} s at most"
+        told.append(f"work: {config.steps} steps of {config.samples} samples{most}")
+    for line in told:
+        if line:
+            clock.console.print(f"           {line}", markup=False)
+
+
 def _fitted(
     capture: Capture, config: FitConfig | NerfactoFitConfig, on_progress: ProgressCallback
-) -> HashField | NerfactoField:
+) -> tuple[HashField | NerfactoField, Capture]:
+    """The field, and the capture with what became known of its photos."""
     if isinstance(config, FitConfig):
-        return fit_field(capture, config, on_progress)
-    return fit_nerfacto(capture, config, on_progress)
+        done = fit_capture(capture, config, on_progress)
+        return done.field, done.capture
+    return fit_nerfacto(capture, config, on_progress), capture
 
 
 def _loaded(task: Sources, clock: Clock) -> tuple[Capture, Landmarks | None]:

@@ -17,6 +17,7 @@ from refield.field.encoding import Contraction, large_zeros
 from refield.field.kernels.reference import Aim
 from refield.field.occupancy import OccupancyTrainer
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
+from refield.field.photo_size import PhotoSizeConfig, as_read, at_full_size
 from refield.field.photos import UNCHANGED, Photos, Since
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.sampling import RESOLUTION, STOP, OccupancySampler
@@ -44,6 +45,8 @@ class FitConfig:
     """gradient scaling reaches 1 at this many core radii from the camera (§10.1)"""
     photos: PhotoModelConfig = field(default_factory=PhotoModelConfig)
     """what is found out about the photos, beside the field"""
+    size: PhotoSizeConfig = field(default_factory=PhotoSizeConfig)
+    """at which the photos are read"""
     field: HashFieldConfig = field(default_factory=HashFieldConfig)
     """shape of the field"""
     finest_auto: bool = True
@@ -107,11 +110,7 @@ class Fitted:
     """with the photos' exposures, poses and lenses as the fit found them, where it was to find them"""
 
 
-# While exposures are found, colours do not depend on where they are seen from: each photo has directions of its own,
-# by which a field would learn its exposure. Of the harmonics' 16 columns in the colours' first matrix one stays, the
-# constant's.
-_PLAIN = 0.5  # of the fit
-_COLOUR_IN, _DIRECTED = 3, 15
+_COLOUR_IN, _DIRECTED = 3, 15  # which parameter takes in directions, and in how many columns, but for a constant
 ProgressCallback = Callable[[FitProgress], None]
 StepCallback = Callable[[int, HashField], None]
 """Hears how many steps are done and the field as they left it, in training; it is not to change it."""
@@ -139,6 +138,7 @@ def fit_capture(
     *,
     since: Since = UNCHANGED,
     start: HashField | None = None,
+    goes_on: bool = False,
     on_step: StepCallback | None = None,
 ) -> Fitted:
     """Fit a field to the capture's training frames.
@@ -155,6 +155,7 @@ def fit_capture(
         InputError: a GPU is wanted and there is none.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row; it holds the last good state.
     """
+    capture, since = as_read(capture, since, config.size)
     began, photos = time.perf_counter(), Photos.of(capture, since, most_pixels(config))
     for attempt in range(_TRIES):
         seed = config.seed + attempt
@@ -166,7 +167,7 @@ def fit_capture(
                 found = capture
             else:
                 may_give_up = start is None and attempt < _TRIES - 1
-                run = _Fit(model, photos, config, on_progress, on_step, began=began)
+                run = _Fit(model, photos, config, on_progress, on_step, began=began, goes_on=goes_on)
                 run.run(may_give_up)
                 found = run.photos.told(capture, run.judge, model)
             break
@@ -175,7 +176,7 @@ def fit_capture(
         except NonFiniteError as error:
             error.field = model.eval().requires_grad_(False)
             raise
-    return Fitted(model.eval().requires_grad_(False), found)
+    return Fitted(model.eval().requires_grad_(False), at_full_size(found))
 
 
 def _new_field(capture: Capture, config: FitConfig, seed: int) -> HashField:
@@ -186,7 +187,11 @@ def _new_field(capture: Capture, config: FitConfig, seed: int) -> HashField:
         shape = replace(shape, finest=_finest_for(capture.train, contraction, shape.log2_table))
     step = 2 * contraction.radius * 4 / shape.finest  # about two pixels
     grid = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.uint8)
-    return HashField(shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), seed)
+    model = HashField(shape, OccupancySampler(contraction, grid, max(step, contraction.radius / 192)), seed)
+    if config.photos.exposures:  # see `PhotoModel.plain`
+        with torch.no_grad():
+            model.networks[_COLOUR_IN - 1][:, -_DIRECTED:] = 0
+    return model
 
 
 def _opened(start: HashField) -> HashField:
@@ -300,15 +305,14 @@ class _Fit:
         on_progress: ProgressCallback | None,
         on_step: StepCallback | None,
         began: float | None = None,
+        goes_on: bool = False,
     ) -> None:
+        self.goes_on = goes_on
         self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
-        self.pixels, self.judge = photos.bank(), photos.judge(config.photos.exposures)
+        self.pixels, self.judge = photos.bank(), photos.judge()
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model)
-        self.plain = config.photos.exposures
-        if self.plain:
-            with torch.no_grad():
-                self.adam.parameters[_COLOUR_IN][:, -_DIRECTED:] = 0
+        self.plain = not self.adam.parameters[_COLOUR_IN][:, -_DIRECTED:].any()
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
@@ -354,7 +358,7 @@ class _Fit:
         out."""
         if self.steps_done not in (_FIRST_STEP, _SECOND_STEP):
             return False
-        now = -10 * math.log10(max(self.loss, 1e-12)), self.judge.psnr(self.model)
+        now = -10 * math.log10(max(self.loss, 1e-12)), self.judge.psnr(self.model, self.photos.exposing)
         self.model.train()
         if self.steps_done == _FIRST_STEP or self.first is None:
             self.first = now
@@ -363,19 +367,23 @@ class _Fit:
         return taught > 0 and left_out < _BY_HEART * taught
 
     def _step(self, step: int, progress: float) -> None:
+        if self.photos.may_expose(progress):
+            self.photos.exposing = self.judge.tells_exposures(self.model)
+            self.model.train()
         n = self.rays_per_step
         asked = self.photos.ask(torch.randint(len(self.pixels), (n,)), progress)
         model, sampler = self.model, self.model.sampler
         space = (sampler.contraction.centre, sampler.contraction.radius)
         aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
-        done = kernels.train_step(asked.batch, space, sampler.grid, sampler.lattice, field, aim, self.adam.grads)
-        rate = rate_factor(progress)
-        if self.plain and progress < _PLAIN:
+        where = (space, sampler.grid, sampler.lattice)
+        done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, fine=sampler.fine)
+        rate = rate_factor((1 + progress) / 2 if self.goes_on else progress)
+        if self.plain and self.photos.plain(progress):
             self.adam.grads[_COLOUR_IN][:, -_DIRECTED:] = 0
         if self.adam.step(self.config.rate * rate, done.loss):
             self.loss = done.loss if math.isnan(self.loss) else self.loss + 0.03 * (done.loss - self.loss)
-            self.occupancy.observe(step, done.cells, done.weights, done.sigmas)
+            self.occupancy.observe(step, done.cells, done.weights, done.sigmas, done.parts)
             self.photos.learn(asked, done, progress, rate)
         self._resize(n, len(done.weights))
 
@@ -398,7 +406,7 @@ class _Fit:
 
     def _look(self, step: int) -> float:
         self.photos.inform(self.judge)
-        psnr = self.judge.psnr(self.model)
+        psnr = self.judge.psnr(self.model, self.photos.exposing)
         self.model.train()
         if self.on_progress:
             seconds = time.perf_counter() - self.began

@@ -63,8 +63,9 @@ def move(model: HashField, device: torch.device) -> None:
     """The field's parameters and its sampler to a device, in place."""
     model.to(device)
     space = model.sampler.contraction
-    grid, centre = model.sampler.grid.to(device), space.centre.to(device)
-    model.sampler = replace(model.sampler, contraction=Contraction(centre, space.radius), grid=grid)
+    grid, fine = model.sampler.grid.to(device), model.sampler.fine
+    space = Contraction(space.centre.to(device), space.radius)
+    model.sampler = replace(model.sampler, contraction=space, grid=grid, fine=None if fine is None else fine.to(device))
 
 
 class _GpuFit:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from refield.field.fit import FitConfig, most_pixels
 from refield.field.fit_nerfacto import NerfactoFitConfig
+from refield.field.photo_size import as_read
+from refield.field.photos import UNCHANGED
 from refield.field.pixels import DIRECTIONS_MOST
 from refield.field.render import CHUNK
 from refield.field.sampling import RESOLUTION
@@ -39,6 +41,8 @@ class Memory:
 
 def memory_of(capture: Capture, config: FitConfig | NerfactoFitConfig) -> Memory:
     """What the fit of either architecture will take for this capture."""
+    if isinstance(config, FitConfig):
+        capture = as_read(capture, UNCHANGED, config.size)[0]
     pixels = sum(f.camera.width * f.camera.height for f in capture.train)
     most = most_pixels(config) if isinstance(config, FitConfig) else None
     photos = 3 * pixels if most is None or pixels <= most else 7 * most  # with its place in the photo
@@ -46,7 +50,7 @@ def memory_of(capture: Capture, config: FitConfig | NerfactoFitConfig) -> Memory
     shape = config.field
     tables = shape.levels * (1 << shape.log2_table) * 8
     a_step = config.samples if isinstance(config, FitConfig) else 3 * config.rays * config.field.samples
-    cells = RESOLUTION**3 * (16 + 1 + 1 + 8)
+    cells = RESOLUTION**3 * (16 + 1 + 1 + 8 + 8 + 5 * 8 + 4)  # the latter of their parts
     sample = 3 * 8 * shape.levels + 40
     work = CHUNK * _ROOM * (8 * shape.levels + 28) + 2 * a_step * sample
     return Memory(photos, distinct if distinct <= DIRECTIONS_MOST else 0, 4 * tables + cells, work)

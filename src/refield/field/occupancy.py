@@ -7,6 +7,7 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.encoding import large_zeros
+from refield.field.parts import Parts
 from refield.field.pixels import PixelBank
 from refield.field.radiance import HashField
 from refield.field.render import CHUNK
@@ -21,7 +22,8 @@ _PROBED_AT_FIRST, _PROBED = 16, 64  # one in so many cells, each time
 # benefit of the doubt a photo's background is learnt as haze before the cameras opposite, and new views meet it
 _CAMERAS = 2.0
 # A sample's opacity; once surfaces have become sharp, what is thinner than this where cameras stand is haze: for the
-# cameras opposite it is a part of their background, for a new camera it lies before everything
+# cameras opposite it is a part of their background, for a new camera it lies before everything. So is a part of a cell
+# anywhere that is thinner than this from side to side: surfaces find room in what is left
 _HAZE = 0.3
 _BACKGROUND = 5.0  # core radii; a cell that no ray ever crossed is taken for empty, unless it is further out
 
@@ -45,6 +47,8 @@ class OccupancyTrainer:
         self.rounds = 1  # renewals of the grid, from 1
         self.open = self.allowed.nonzero()[:, 0]
         self.sharp = False
+        self.parts: Parts | None = None
+        """of cells; from the first step on that says in which its samples were"""
         self.among_cameras = torch.zeros(cells, dtype=torch.bool, device=device)
         self.state = large_zeros(cells, 4).to(device)
         """see `kernels.reference.observe`"""
@@ -61,9 +65,13 @@ class OccupancyTrainer:
         """(R**3,) the most that some ray gave each cell of late."""
         return self.state[:, 1]
 
-    def observe(self, step: int, cells: Tensor, w: Tensor, sigmas: Tensor) -> None:
-        """After each step: samples' cells (S,), weights (S,), densities (S,). Renews the grid every 16 or 32 steps."""
+    def observe(self, step: int, cells: Tensor, w: Tensor, sigmas: Tensor, parts: Tensor | None = None) -> None:
+        """After each step: samples' cells (S,), weights (S,), densities (S,), and in which part of its cell each was.
+        Renews the grid every 16 or 32 steps."""
         kernels.observe(self.state, self.rounds, DECAY, cells, w, sigmas)
+        if parts is not None and self.sharp:
+            self.parts = self.parts or Parts(self.model)
+            self._ask(self.parts, (cells, parts), w, sigmas)
         every = EVERY if step < _OFTEN_UNTIL else 2 * EVERY
         if step % every == every - 1:
             self.renew(step)
@@ -81,7 +89,8 @@ class OccupancyTrainer:
             again = self.open[torch.randint(len(self.open), (len(self.open) // 100,), device=self.open.device)]
             self.state[again, 1] = self.state[again, 1].clamp_min(4 * _WEIGHT)
         self.sharp = step >= 4 * self.cull_from
-        self._set(_WEIGHT if step >= self.cull_from else -1.0, self.sharp)
+        grid = self._kept(_WEIGHT if step >= self.cull_from else -1.0, self.sharp)
+        self._show(grid, cells)
         self.rounds += 1
 
     def _probe(self, cells: Tensor) -> Tensor:
@@ -93,17 +102,28 @@ class OccupancyTrainer:
             sigma = model.sigma(kernels.hash_density(unit, model.density_net))
         return -torch.expm1(-sigma * self.state[cells, 2])
 
-    def _set(self, weight: float, only_seen: bool) -> None:
-        """Show cells that are opaque enough and have a weight above ``weight``."""
+    def _ask(self, known: Parts, places: tuple[Tensor, Tensor], w: Tensor, sigmas: Tensor) -> None:
+        """Note which parts samples of weights (S,) and densities (S,) are a reason to look into; and probe some."""
+        known.observe(*places, (known.opacity(places[0], sigmas) > _HAZE) & (w > _WEIGHT / 2))
+        known.probe(places[0], _HAZE)
+
+    def _show(self, grid: Tensor, tried: Tensor | None = None) -> None:
+        """Look into the cells (R, R, R) uint8, as far as their parts are not known to be empty."""
+        self.model.looking_where(*((grid,) if self.parts is None else self.parts.narrowed(grid, tried)))
+
+    def _kept(self, weight: float, only_seen: bool) -> Tensor:
+        """The cells that are opaque enough and have a weight above ``weight``, (R, R, R) uint8."""
         opacity = min(_OPACITY, float(self.state[:, 0].mean()))
         allowed = self.allowed
         if self.sharp:
             allowed = allowed & ~(self.among_cameras & (self.state[:, 0] < _HAZE))
         grid = kernels.keep(self.state, allowed, opacity, weight, only_seen)
-        self.model.looking_where(grid.reshape(self.model.sampler.grid.shape))
+        return grid.reshape(self.model.sampler.grid.shape)
 
     def settle(self, pixels: PixelBank, rays: int = 200_000) -> None:
-        """The final grid: every opaque cell that some training ray sees. Leaves the model in training mode.
+        """The final grid: every opaque cell that some training ray sees, without the parts that are known to be empty.
+
+        Leaves the model in training mode.
 
         Where no ray ever went the density is whatever the networks make of it: haze before a new camera.
         """
@@ -111,13 +131,17 @@ class OccupancyTrainer:
         for _ in range(2):
             for cells in opaque.split(1 << 18):
                 self.state[cells, 0] = torch.maximum(self.state[cells, 0], self._probe(cells))
-        self._set(-1.0, False)
+        self._show(self._kept(-1.0, False))
         self.state[:, 1] = torch.where(self.state[:, 3] >= 0, self.state[:, 1], 0)
         for chosen in torch.randint(len(pixels), (rays,)).split(CHUNK):
             r = pixels.rays(chosen)
             with torch.no_grad():
                 samples = self.model.samples(r, jitter=True)
                 x, _ = samples.positions(r)
-                w = weights(self.model.density(x), samples)
-            kernels.scatter_max(w, self.model.sampler.cells(x), self.state[:, 1])
-        self._set(_WEIGHT / 2, False)
+                sigmas = self.model.density(x)
+                w = weights(sigmas, samples)
+            cells, parts = self.model.sampler.places(x)
+            kernels.scatter_max(w, cells, self.state[:, 1])
+            if self.parts is not None:
+                self._ask(self.parts, (cells, parts), w, sigmas)
+        self._show(self._kept(_WEIGHT / 2, False))

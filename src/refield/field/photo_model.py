@@ -22,7 +22,10 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame
 from refield.scene.exposure import Exposure
 
-_EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.02, 0.25, 0.1  # of a fit: what is asked of it must be there first
+_EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.1, 0.25, 0.1  # of a fit: what is asked of it must be there first
+# So far into a fit that finds exposures, colours do not depend on where they are seen from: each photo has directions
+# of its own, by which a field would learn its exposure.
+_PLAIN = 0.5
 _PLACES = 16  # where rays end, a side of the contracted cube
 _MOVING = 4  # every so-many-th ray tells how poses are wrong
 
@@ -60,8 +63,22 @@ class PhotoModel:
         self._across = min(_PLACES, self._side)
         places = self._across**3
         self.exposures = ExposureFit(frames, places) if config.exposures else None
+        self.exposing = False
+        """whether they are heeded; set by the fit, which knows photos that are left out"""
+        self._asked_whether = False
         self.poses = PoseFit(frames, float(distance)) if config.poses else None
         self.trust = PhotoTrust(bank, places) if config.trust else None
+
+    def may_expose(self, progress: float) -> bool:
+        """Whether now, once in a fit, is to be found out if the photos' exposures differ at all: gains of photos that
+        were exposed alike would take up what the field does not show yet."""
+        now = self.exposures is not None and not self._asked_whether and progress >= _EXPOSED_FROM
+        self._asked_whether |= now
+        return now
+
+    def plain(self, progress: float) -> bool:
+        """Whether colours are not to depend on where they are seen from yet, lest the field learn the exposures."""
+        return self.exposures is not None and progress < (_PLAIN if self.exposing else _EXPOSED_FROM)
 
     def ask(self, pixels: Tensor, progress: float) -> Asked:
         """Rays of pixels (N,) as they stand, with the photos' gains and trust; ``progress`` of the fit in [0, 1]."""
@@ -72,7 +89,7 @@ class PhotoModel:
         else:
             rays = self.poses.rays(owner, bank.camera_directions(pixels, owner))
         gains = basis = patches = trust = None
-        if self.exposures is not None:
+        if self.exposures is not None and self.exposing:
             basis = bank.vignetting_basis(pixels, owner)
             gains = self.exposures.gains(owner, basis)
         if self.trust is not None and progress >= _TRUSTED_FROM:
@@ -87,7 +104,7 @@ class PhotoModel:
     def learn(self, asked: Asked, done: Stepped, progress: float, rate: float) -> None:
         """Take in what a step found; ``rate`` in [0, 1] falls as the fit's."""
         batch, owner = asked.batch, asked.owner
-        if self.exposures is not None and asked.basis is not None and progress >= _EXPOSED_FROM:
+        if self.exposures is not None and asked.basis is not None:
             assert batch.gains is not None and done.shown is not None and done.errors is not None
             weight = 1.0 if batch.trust is None else batch.trust[:, None].sqrt()
             seen, errors = weight * batch.gains * done.shown, weight * done.errors
@@ -122,7 +139,7 @@ class PhotoModel:
         self.inform(judge)
         found = {f.name: f for f in self._training()}
         lenses = self._lenses()
-        gains = judge.gains(field).tolist() if self.exposures is not None else []
+        gains = judge.gains(field).tolist() if self.exposing else []
         for i, frame in enumerate(judge.frames):
             exposure = frame.exposure
             if i < len(gains):
@@ -138,6 +155,6 @@ class PhotoModel:
 
     def _training(self) -> tuple[Frame, ...]:
         frames = self.bank.frames if self.poses is None else self.poses.found()
-        if self.exposures is None:
+        if self.exposures is None or not self.exposing:
             return frames
         return tuple(replace(f, exposure=e.on(f.exposure)) for f, e in zip(frames, self.exposures.found()))

@@ -58,9 +58,9 @@ class Photos:
         """The pixels that teach."""
         return PixelBank(self.train, most=self.most, masks=self.taught)
 
-    def judge(self, exposed: bool = False) -> HeldOut:
-        """The pixels that do not; see `HeldOut`."""
-        return HeldOut(self.held_out, masks=self.judged, exposed=exposed)
+    def judge(self) -> HeldOut:
+        """The pixels that do not."""
+        return HeldOut(self.held_out, masks=self.judged)
 
 
 class HeldOut:
@@ -71,11 +71,9 @@ class HeldOut:
         frames: tuple[Frame, ...],
         count: int = 16384,
         masks: Sequence[Tensor | None] | None = None,
-        exposed: bool = False,
     ) -> None:
-        """``masks``: see `PixelBank`. ``exposed``: the photos' exposures are not known: each one's is found by the
-        pixels of its left half, and those of its right half judge."""
-        self.frames, self.exposed = frames, exposed
+        """``masks``: see `PixelBank`."""
+        self.frames = frames
         self.rays: Rays | None = None
         if not frames:
             return
@@ -86,7 +84,8 @@ class HeldOut:
             self._places, self._basis = bank.place_of(chosen), bank.vignetting_basis(chosen, self.owner)
             self._fallen = torch.ones(len(bank), 1)
             width = torch.tensor([f.camera.width for f in frames])[self.owner]
-            self._left = self._places % width < width // 2
+            self.left: Tensor = self._places % width < width // 2
+            """(P,) bool: pixels of the left halves of photos"""
 
     def learn(self, cameras: Sequence[Camera], vignetting: Tensor) -> None:
         """What has become known of the photos' lenses, of each one's as it is now, and of their vignetting (F, 3)."""
@@ -101,21 +100,33 @@ class HeldOut:
         self.rays = Rays(self.rays.origins, directions.to(device))
         self._fallen = (vignetting[self.owner] * self._basis).sum(-1, keepdim=True).exp()
 
-    def psnr(self, model: Field) -> float:
-        """dB over the pixels; NaN if there are none."""
+    def psnr(self, model: Field, exposed: bool = False) -> float:
+        """dB over the pixels; NaN if there are none. ``exposed``: the photos' exposures are not known: each one's is
+        found by the pixels of its left half, and those of its right half judge."""
         if self.rays is None:
             return math.nan
-        rgb, truth = self._shown(model), self.truth
-        if self.exposed:
-            rgb = (rgb * self._gains(rgb, self._left)[self.owner]).clamp(0, 1)[~self._left]
-            truth = truth[~self._left]
-        return -10 * math.log10(max(float((rgb - truth).square().mean()), 1e-12))
+        rgb = self._shown(model)
+        return self._psnr_of(self._exposed(rgb), ~self.left) if exposed else self._psnr_of(rgb, None)
+
+    def tells_exposures(self, model: Field) -> bool:
+        """Whether the photos' right halves come out better for exposures that their left halves tell."""
+        if self.rays is None:
+            return False
+        rgb, right = self._shown(model), ~self.left
+        return self._psnr_of(self._exposed(rgb), right) > self._psnr_of(rgb, right)
+
+    def _exposed(self, rgb: Tensor) -> Tensor:
+        return (rgb * self._gains(rgb, self.left)[self.owner]).clamp(0, 1)
+
+    def _psnr_of(self, rgb: Tensor, of: Tensor | None) -> float:
+        off = (rgb - self.truth).square()
+        return -10 * math.log10(max(float((off if of is None else off[of]).mean()), 1e-12))
 
     def gains(self, model: Field) -> Tensor:
         """How each photo is exposed, by all of its pixels here, (F, 3); see `Exposure.gains`."""
         if self.rays is None:
             return torch.ones(0, 3)
-        return self._gains(self._shown(model), torch.ones_like(self._left))
+        return self._gains(self._shown(model), torch.ones_like(self.left))
 
     def _shown(self, model: Field) -> Tensor:
         """As the photos show it, but for their gains."""

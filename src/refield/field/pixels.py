@@ -13,6 +13,8 @@ from refield.scene.images import frame_image
 
 DIRECTIONS_MOST = 1 << 29  # bytes; camera-space directions are kept for every pixel of every distinct camera up to here
 
+_TABLE_MOST = 64  # directions in the tables for each pixel of the bank
+
 
 class PixelBank:
     """P pixels of F photos in one row: colours uint8, rays made on demand."""
@@ -53,7 +55,8 @@ class PixelBank:
         self._sizes = torch.tensor([(c.width, c.height) for c in self._cameras])
         self._tables: dict[Camera, Tensor] = {}
         distinct = sum(c.width * c.height for c in self._cameras)
-        self._tabulate = distinct * 12 <= DIRECTIONS_MOST
+        # a few pixels of large photos, as those that judge a fit, are not worth the others' directions
+        self._tabulate = distinct * 12 <= DIRECTIONS_MOST and distinct <= _TABLE_MOST * len(self)
 
     def __len__(self) -> int:
         return int(self.starts[-1])

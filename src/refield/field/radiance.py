@@ -14,9 +14,9 @@ from refield.field import kernels
 from refield.field.encoding import Contraction, HashGrid, geometric_levels
 from refield.field.kernels.reference import DensityNet, Networks, truncated_exp
 from refield.field.networks import weight
-from refield.field.sampling import OccupancySampler
+from refield.field.sampling import STOP, OccupancySampler
 from refield.field.stored import State, read_field, sampler_from, state_of, write_field
-from refield.field.volrend import Samples
+from refield.field.volrend import Rendering, Samples
 from refield.scene.capture import Rays
 
 
@@ -103,6 +103,15 @@ class HashField(nn.Module):
         """Where to evaluate the field along rays: the sampler's places, ended behind the first opaque surface."""
         return self.sampler.visible(rays, self.density_net, jitter)
 
+    def rendered(self, rays: Rays) -> Rendering:
+        """What rays see, without gradients: `refield.field.render.render_rays` in one go."""
+        sampler, enc = self.sampler, self.encoding
+        space = (sampler.contraction.centre, sampler.contraction.radius)
+        lines = (rays.origins, rays.directions, rays.origins.new_zeros(len(rays)))
+        field = (enc.tables, enc.resolutions, self.networks)
+        with torch.no_grad():
+            return Rendering(*kernels.render(lines, space, sampler.grid, sampler.lattice, field, STOP, sampler.fine))
+
     @property
     def networks(self) -> Networks:
         """The density network's two matrices and the colour network's three."""
@@ -150,6 +159,6 @@ class HashField(nn.Module):
         """Inverse of :meth:`save`. Raises InputError naming the file that is missing or not ours."""
         return read_field(folder, "HashField", HashField.from_state)
 
-    def looking_where(self, grid: Tensor) -> None:
-        """Replace the occupancy grid (R, R, R) uint8."""
-        self.sampler = replace(self.sampler, grid=grid)
+    def looking_where(self, grid: Tensor, fine: Tensor | None = None) -> None:
+        """Replace the occupancy grid (R, R, R) uint8, and what is known of its cells' parts (R, R, R) int64."""
+        self.sampler = replace(self.sampler, grid=grid, fine=fine)

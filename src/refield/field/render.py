@@ -45,7 +45,8 @@ def _rendered(field: Field, rays: Rays) -> Rendering:
     """Of one chunk."""
     unchanged: Callable[[Rays], tuple[Field, Tensor]] | None = getattr(field, "unchanged", None)
     if unchanged is None:
-        return render_rays(field, rays)
+        whole: Callable[[Rays], Rendering] | None = getattr(field, "rendered", None)
+        return render_rays(field, rays) if whole is None else whole(rays)
     before, same = unchanged(rays)
     rows, rest = same.nonzero()[:, 0], (~same).nonzero()[:, 0]
     if len(rest) == 0:

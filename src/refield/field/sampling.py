@@ -10,6 +10,7 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.encoding import Contraction
+from refield.field.kernels.masks import marked, part_of
 from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
@@ -31,6 +32,9 @@ class OccupancySampler:
     """world units"""
     far: float = 1e3
     """in radii of the core cube"""
+    fine: Tensor | None = None
+    """(R, R, R) int64: which parts of occupied cells may hold something, see `kernels.masks.marked`; 0, or None for all
+    of them, where nothing so fine is known. Whoever lets something new into a cell has to set its mask to 0."""
 
     @property
     def resolution(self) -> int:
@@ -39,12 +43,12 @@ class OccupancySampler:
     def __call__(self, rays: Rays, jitter: bool = False) -> Samples:
         """Packed samples of N rays; see `Samples`."""
         with torch.no_grad():
-            return Samples(*kernels.march(*self._question(rays, jitter)))
+            return Samples(*kernels.march(*self._question(rays, jitter), self.fine))
 
     def visible(self, rays: Rays, net: DensityNet, jitter: bool = False, stop: float = STOP) -> Samples:
         """As a call, but nothing behind the sample where the optical depth passes ``stop``."""
         with torch.no_grad():
-            return Samples(*kernels.march_visible(*self._question(rays, jitter), net, stop))
+            return Samples(*kernels.march_visible(*self._question(rays, jitter), net, stop, self.fine))
 
     def _question(self, rays: Rays, jitter: bool) -> tuple[Rays3, Space, Tensor, Lattice]:
         n = len(rays)
@@ -59,13 +63,20 @@ class OccupancySampler:
 
     def cells(self, x: Tensor) -> Tensor:
         """Flat index of the grid cell that holds each world point, (..., 3) -> (...,) int64."""
+        return self.places(x)[0]
+
+    def places(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The grid cell (flat index) that holds each world point, and which of its 64 parts; (..., 3) -> (...,) int64
+        each."""
         r = self.resolution
-        ijk = ((self.contraction(x) + 2) * (r / 4)).long().clamp_(0, r - 1)
-        return (ijk[..., 0] * r + ijk[..., 1]) * r + ijk[..., 2]
+        quarter = ((self.contraction(x) + 2) * (r / 4) * 4).long().clamp_(0, 4 * r - 1)
+        i, j, k = (quarter >> 2).unbind(-1)
+        return (i * r + j) * r + k, part_of(quarter)
 
     def occupied(self, x: Tensor) -> Tensor:
         """Whether the sampler would look at world points (..., 3) -> (...,) bool."""
-        return self.grid.reshape(-1)[self.cells(x)] > 0
+        places = (self.contraction(x.reshape(-1, 3)) + 2) * (self.resolution / 4)
+        return marked(places, self.grid, self.fine).reshape(x.shape[:-1])
 
     def step_at(self, cells: Tensor) -> Tensor:
         """Length of a sample in the given cells (K,), world units (K,)."""
@@ -100,13 +111,16 @@ class OccupancySampler:
     ) -> OccupancySampler:
         """The same sampler with the cells that touch the world boxes (2, 3) looked up anew in ``density``.
 
-        A cell is occupied if at one of ``probes`` points a sample would have an opacity above ``threshold``.
+        A cell is occupied if at one of ``probes`` points a sample would have an opacity above ``threshold``. Of its
+        parts nothing is known any more.
         """
-        grid = self.grid.clone()
+        grid, fine = self.grid.clone(), None if self.fine is None else self.fine.clone()
         for box in boxes:
             cells = self.cells_in(box)
             grid.view(-1)[cells] = self._probe(density, cells, threshold, probes)
-        return replace(self, grid=grid)
+            if fine is not None:
+                fine.view(-1)[cells] = 0
+        return replace(self, grid=grid, fine=fine)
 
     def _probe(self, density: Callable[[Tensor], Tensor], cells: Tensor, threshold: float, probes: int) -> Tensor:
         found = torch.zeros(len(cells), dtype=torch.bool, device=cells.device)

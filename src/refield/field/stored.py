@@ -29,7 +29,7 @@ Kind = TypeVar("Kind")
 def state_of(field: nn.Module, config: DataclassInstance, sampler: OccupancySampler) -> State:
     """Everything needed to rebuild a field, which is named by its class."""
     tensors = {k: v.detach().contiguous() for k, v in field.state_dict().items()}
-    tensors["occupancy"] = sampler.grid.contiguous()
+    tensors |= sampler_out(sampler)
     space = sampler.contraction
     facts = {
         "architecture": type(field).__name__,
@@ -43,7 +43,32 @@ def state_of(field: nn.Module, config: DataclassInstance, sampler: OccupancySamp
 def sampler_from(tensors: dict[str, Tensor], facts: dict[str, Any]) -> OccupancySampler:
     """The sampler in a state; its grid is taken out of ``tensors``."""
     space = Contraction(torch.tensor(facts["contraction"]["centre"]), facts["contraction"]["radius"])
-    return OccupancySampler(space, tensors.pop("occupancy"), **facts["sampler"])
+    grid, fine = occupancy_in(tensors)
+    return OccupancySampler(space, grid, **facts["sampler"], fine=fine)
+
+
+def sampler_out(sampler: OccupancySampler) -> dict[str, Tensor]:
+    """Where a sampler looks, as tensors: its grid, and the masks of the cells that are occupied."""
+    tensors = {"occupancy": sampler.grid.contiguous()}
+    if sampler.fine is not None:
+        tensors["parts"] = sampler.fine[sampler.grid > 0]
+    return tensors
+
+
+def occupancy_in(tensors: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
+    """The grid and the masks of :func:`sampler_out`, which are taken out of ``tensors``; older files have no masks.
+
+    Raises:
+        KeyError, ValueError: there is no grid, or the masks are not those of its cells.
+    """
+    grid, parts = tensors.pop("occupancy"), tensors.pop("parts", None)
+    if parts is None:
+        return grid, None
+    if parts.dtype != torch.int64 or parts.shape != (int((grid > 0).sum()),):
+        raise ValueError("there is not a mask for each occupied cell")
+    fine = torch.zeros(grid.shape, dtype=torch.int64)
+    fine[grid > 0] = parts
+    return grid, fine
 
 
 def write_field(folder: Path, state: State) -> None:

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.kernels.cpu.simd import JIT
+from refield.field.kernels.reference import TRACE
 from refield.scene.capture import Rays
 
-_TRACE = 0.05  # light that reaches a background which goes on for ever, and would move the mean distance there
 _Samples = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 
 
@@ -87,7 +87,7 @@ def composite(sigmas: Tensor, rgbs: Tensor, samples: Samples) -> Rendering:
     w = weights(sigmas, samples)
     mid = (samples.t_starts + samples.t_ends) / 2
     before = w / -torch.expm1(-sigmas * (samples.t_ends - samples.t_starts)).clamp(max=-1e-9)  # transmittance
-    lit = (before > _TRACE).to(w.dtype)
+    lit = (before > TRACE).to(w.dtype)
     values = torch.cat([rgbs, torch.stack([lit * mid, lit, torch.ones_like(mid)], -1)], -1)
     summed = kernels.accumulate(w, values, samples.ray_offsets)
     return Rendering(summed[:, :3], summed[:, 3] / summed[:, 4].clamp_min(1e-6), summed[:, 5])

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 _UNDISTORT_STEPS = 12  # Newton; double precision is reached in 4-6 for the lenses we accept
+_UNDISTORTED = 1e-10  # a step so small leaves an error of its square
 
 
 @dataclass(frozen=True)
@@ -106,5 +107,8 @@ class Camera:
             det = j11 * j22 - j12 * j12
             step_x = (j22 * e[..., 0] - j12 * e[..., 1]) / det
             step_y = (j11 * e[..., 1] - j12 * e[..., 0]) / det
-            xy = xy - torch.stack([step_x, step_y], -1)
+            step = torch.stack([step_x, step_y], -1)
+            xy = xy - step
+            if not bool((step.abs() > _UNDISTORTED).any()):
+                break
         return xy.to(distorted.dtype)

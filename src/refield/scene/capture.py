@@ -7,9 +7,9 @@ photo cannot be used as a view by mistake. World units and axes are the capture'
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -49,6 +49,19 @@ class Photo:
     """Writes the file when its pixels are first asked for; None for a file that is there."""
     exposure: Exposure | None = field(default=None, kw_only=True)
     """How it was exposed, if that is known: its pixels are then read as those of a photo of neutral exposure."""
+    file_size: tuple[int, int] | None = field(default=None, kw_only=True)
+    """Width and height of the file, where ``camera`` takes a smaller picture; None: the camera's."""
+
+    def shrunk(self, part: float) -> Self:
+        """The same photo, to be read at a part of its size."""
+        size = self.file_size or (self.camera.width, self.camera.height)
+        return self if part == 1 else replace(self, camera=self.camera.shrunk(part), file_size=size)
+
+    def whole(self) -> Self:
+        """The same photo, to be read at the size of its file."""
+        if self.file_size is None:
+            return self
+        return replace(self, camera=self.camera.scaled(*self.file_size), file_size=None)
 
 
 @dataclass(frozen=True)

@@ -172,19 +172,25 @@ def check_decodes(path: Path) -> None:
 
 
 def frame_image(photo: Photo) -> Tensor:
-    """The pixels of a photo, uint8 (H, W, 3); of neutral exposure, if its own is known.
+    """The pixels of a photo at its camera's size, uint8 (H, W, 3); those of a larger file are averaged. They are as of
+    neutral exposure, if the photo's own is known.
 
     Raises:
-        InputError: as `read_image`, or if the size is not the camera's.
+        InputError: as `read_image`, or if the file's size is not what is known of it.
     """
     if photo.made is not None and not photo.path.exists():
         photo.made(photo.path)
     image = read_image(photo.path)
     height, width = image.shape[:2]
-    if (width, height) != (photo.camera.width, photo.camera.height):
-        expected = f"its camera says {photo.camera.width}x{photo.camera.height}"
+    camera = photo.camera
+    wide, high = photo.file_size or (camera.width, camera.height)
+    if (width, height) != (wide, high):
+        expected = f"its camera says {wide}x{high}"
         raise InputError(photo.path, f"has {width}x{height} pixels, {expected}", "correct w and h, or the image")
-    return image if photo.exposure is None else photo.exposure.neutral(image, photo.camera)
+    if photo.file_size is not None:
+        small = cv2.resize(image.numpy(), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        image = torch.from_numpy(small)
+    return image if photo.exposure is None else photo.exposure.neutral(image, camera)
 
 
 def scaled_image(photo: Photo, camera: Camera) -> Tensor:

@@ -15,6 +15,7 @@ from refield.synthetic.cameras import looking_at
 from refield.synthetic.random_places import Place
 from refield.synthetic.state import Triple
 
+PATHS = ("orbit", "half orbit", "hand-held", "dome", "forward")
 _WAVES = 3  # of a hand's wander
 
 
@@ -88,6 +89,17 @@ def draw_camera(rng: np.random.Generator) -> Camera:
     wide, high = [(1200, 1200), (1200, 900), (900, 1200), (1200, 800)][int(rng.choice(4, p=[0.4, 0.3, 0.15, 0.15]))]
     focal = 600 / float(np.tan(np.deg2rad(rng.uniform(40, 70)) / 2))
     return Camera(wide, high, focal, focal, wide / 2, high / 2)
+
+
+def in_both(camera: Camera) -> Camera:
+    """What upright and turned photos of a camera both show: a square of its shorter side."""
+    side = min(camera.width, camera.height)
+    return Camera(side, side, camera.fx, camera.fy, side / 2, side / 2)
+
+
+def turned(camera: Camera) -> Camera:
+    """The camera held the other way, portrait or landscape."""
+    return Camera(camera.height, camera.width, camera.fy, camera.fx, camera.cy, camera.cx)
 
 
 def draw_path(rng: np.random.Generator, place: Place, camera: Camera) -> CameraPath:

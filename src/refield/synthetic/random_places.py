@@ -23,7 +23,7 @@ from refield.synthetic.state import Item, Triple
 from refield.synthetic.terrain import Terrain
 
 _THICK = 0.04
-_GROUND = 5.0
+GROUND = 5.0
 """of its reach: half the side of ground under the sky"""
 
 
@@ -87,13 +87,13 @@ def draw_place(rng: np.random.Generator, *, outdoors: bool) -> Place:
     }  # fmt: skip
     if family in on_level:
         place = on_level[family](rng, reach)
-        place = replace(place, items=(_level_ground(paint, _GROUND * reach, outdoors), *place.items))
+        place = replace(place, items=(level_ground(paint, GROUND * reach, outdoors), *place.items))
     else:
         place = _rolling(rng, reach, family, paint)
     return replace(place, family=family, ground=kind)
 
 
-def _level_ground(paint: textures.Image, side: float, outdoors: bool) -> Item:
+def level_ground(paint: textures.Image, side: float, outdoors: bool) -> Item:
     """Its top is z = 0."""
     if outdoors:  # one cell for the whole atlas: a large ground needs its texels
         solid: Solid = Terrain(side)
@@ -218,7 +218,7 @@ def _rolling(rng: np.random.Generator, reach: float, family: str, paint: texture
         k, turn = 2 * np.pi / (reach * float(rng.uniform(1.2, 3.0))), float(rng.uniform(0, 2 * np.pi))
         phase, up = float(rng.uniform(0, 2 * np.pi)), high * reach * float(rng.uniform(0.4, 1.0))
         waves.append((float(k * np.cos(turn)), float(k * np.sin(turn)), phase, up))
-    terrain = Terrain(_GROUND * reach, slope, bowl, tuple(waves))
+    terrain = Terrain(GROUND * reach, slope, bowl, tuple(waves))
     low = float(terrain.height(torch.zeros(()), torch.zeros(())))
     ground = Item("ground", terrain, paint, posed((0.0, 0.0, 0.0)))
     patch = replace(_square(reach, 0.75), terrain=terrain)

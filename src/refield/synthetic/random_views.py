@@ -25,6 +25,7 @@ _BEFORE_TARGET = 0.7  # of the way to the target, that must be free
 _OLD_SHARE = 0.35  # of the old views that must show a changed object
 _PAINT, _OTHERWISE = 3.0, 0.15  # how much paint counts beside outline; what is needed of both
 _KEPT_SHARE = 0.15  # ... and one that stays
+_AROUND = 0.2  # of these, where old views look in all directions
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class Views:
     evaluation: list[Tensor]
     distance: float
     target: Triple = (0.0, 0.0, 0.0)
+    around: bool = False
+    """whether the old ones look elsewhere too, in all directions"""
 
     @property
     def all(self) -> list[Tensor]:
@@ -54,7 +57,8 @@ class Views:
         """Whether no camera stands in or close before something, and each has the target in sight."""
         there = fixed.isfinite().double().mean((1, 2))
         near = fixed.flatten(1).amin(1) > _BEFORE_LENS * self.distance
-        sight = [self._in_sight(pose, depth) for pose, depth in zip(self.all, fixed)]
+        asked = slice(len(self.old) if self.around else 0, None)
+        sight = [self._in_sight(pose, depth) for pose, depth in zip(self.all[asked], fixed[asked])]
         return bool(near.all()) and all(sight) and bool((there > 0.3).double().mean() > 0.7)
 
     def _in_sight(self, pose: Tensor, depth: Tensor) -> bool:
@@ -84,7 +88,7 @@ def seen_by(views: Views, fixed: Tensor, drawn: Drawn) -> dict[str, dict[str, fl
             shown, whole = _shares(depths[name + when], others, fixed)
             fine = (shown >= _SHOWN) & (shown >= _CLEAR * whole)
             looks = old if when == " before" else slice(new.start, None)
-            enough = (_OLD_SHARE if changed else _KEPT_SHARE) * len(views.old)
+            enough = (_OLD_SHARE if changed else _KEPT_SHARE) * len(views.old) * (_AROUND if views.around else 1)
             if when == " before" and fine[old].sum() < enough:
                 return None
             # both the old place and the new one are to be looked at by the new photos

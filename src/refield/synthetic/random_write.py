@@ -42,8 +42,9 @@ def write_random(out: Path, config: SynthConfig, on_progress: Progress | None = 
         InputError: Mitsuba is not installed, or nothing that was drawn fitted.
     """
     mitsuba()
-    drawn = random_world(config.seed, config.photos)
-    camera = drawn.camera.shrunk(config.size / max(drawn.camera.width, drawn.camera.height))
+    drawn = random_world(config.seed, config.photos, config.path, config.mixed)
+    part = config.size / max(drawn.camera.width, drawn.camera.height)
+    camera = drawn.camera.shrunk(part)
     factor = exposure_factor(drawn.world.before, camera, drawn.old, drawn.brightness)
     before, after = (state.brightened(factor) for state in (drawn.world.before, drawn.world.after))
     world = replace(drawn.world, before=before, after=after)
@@ -53,7 +54,8 @@ def write_random(out: Path, config: SynthConfig, on_progress: Progress | None = 
         nonlocal done
         first, done = done, done + len(poses)
         tell = None if on_progress is None else lambda k: on_progress(first + k, total)
-        return shoot_state(state, out / folder, (camera, poses), (spp, config.seed * 100_003 + first), tell)
+        cameras = [c.shrunk(part) for c in drawn.cameras(folder, len(poses))]
+        return shoot_state(state, out / folder, (cameras, poses), (spp, config.seed * 100_003 + first), tell)
 
     old, new = shoot("before", before, drawn.old), shoot("after", after, drawn.new)
     evaluation = shoot("eval", after, drawn.evaluation, _CLEANER * config.spp)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -47,7 +48,11 @@ class SynthConfig:
     cameras: int | None = None
     """of the old photos, on 10 heights; 180 if not given (§11.1). Not for the world random"""
     photos: int | None = None
-    """old photos of the world random; if not given, as many as its seed says, 30 to 120"""
+    """old photos of the world random; if not given, as many as its seed says: 30 to 120, from 2000 on 20 to 300"""
+    path: Literal["orbit", "half orbit", "hand-held", "dome", "forward", "inside-out", "walk"] | None = None
+    """family of the cameras' path in the world random; if not given, as its seed says"""
+    mixed: bool = False
+    """portrait and landscape photos in the world random, whatever its seed says"""
     seed: int = 0
     """of textures, surroundings and the paths; of everything in the world random"""
 
@@ -104,24 +109,25 @@ def photograph(world: World, out: Path, config: SynthConfig, on_progress: Progre
 def shoot_state(
     state: State,
     folder: Path,
-    cameras: tuple[Camera, Sequence[Tensor]],
+    cameras: tuple[Camera | Sequence[Camera], Sequence[Tensor]],
     paths: tuple[int, int] = (64, 0),
     on_photo: Callable[[int], None] | None = None,
 ) -> Capture:
     """Photograph a state into a capture's folder (transforms.json, images/).
 
     Args:
-        cameras: the camera, and where it stands: ``world_from_cam`` (4, 4) each.
+        cameras: the camera, or one for each photo, and where it stands: ``world_from_cam`` (4, 4) each.
         paths: light paths a pixel, and the seed of the first photo's.
         on_photo: called with the number of photos done.
     """
     (camera, poses), (spp, seed) = cameras, paths
     tracer, frames = PathTracer(state), []
-    for i, pose in enumerate(poses):
+    each = [camera] * len(poses) if isinstance(camera, Camera) else camera
+    for i, (one, pose) in enumerate(zip(each, poses)):
         path = folder / "images" / f"{i:04d}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, tracer.photo(camera, pose, spp, seed + i))
-        frames.append(Frame(path, camera, f"images/{path.name}", pose))
+        write_image(path, tracer.photo(one, pose, spp, seed + i))
+        frames.append(Frame(path, one, f"images/{path.name}", pose))
         if on_photo is not None:
             on_photo(i + 1)
     capture = Capture(tuple(frames))

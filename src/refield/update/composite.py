@@ -197,7 +197,9 @@ class UpdatedField:
         if self._base is None or not self._marched:
             return visible_samples(self.pretrained, rays, jitter) if not self.boxes else self.sampler(rays, jitter)
         if isinstance(self._base, NerfactoField):
-            known = self._base.samples(rays, jitter, without=replace(self.sampler, grid=self._retold).occupied)
+            known = self._base.samples(
+                rays, jitter, without=replace(self.sampler, grid=self._retold, fine=None).occupied
+            )
             mid, d = known.positions(rays)
             start = mid - d * ((known.t_ends - known.t_starts) / 2)[:, None]
             # an interval that begins where a surface was seen may reach beneath it
@@ -212,7 +214,7 @@ class UpdatedField:
         """Looks into the cells alone that are not shown."""
         grid = torch.zeros_like(self.sampler.grid)
         grid.view(-1)[self.unseen] = 1 - self._told.view(-1)[self.unseen]
-        return replace(self.sampler, grid=grid)
+        return replace(self.sampler, grid=grid, fine=None)
 
     def unchanged(self, rays: Rays) -> tuple[Field, Tensor]:
         """The field before, and which of N rays show what it shows, (N,) bool: they meet no cell in which this visit
@@ -240,7 +242,7 @@ class UpdatedField:
             if len(self.unseen):
                 x = self.sampler.points_in(self.unseen, jitter=False)
                 boxes.append(torch.stack([x.amin(0), x.amax(0)]))
-            cells = finer(replace(self.sampler, grid=grid))
+            cells = finer(replace(self.sampler, grid=grid, fine=None))
             self._changed_of = self.sampler.grid, (cells, tuple(_by_cells(self.sampler, b) for b in boxes))
         return self._changed_of[1]
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from refield.artefacts import read_tensors, write_tensors
 from refield.field.radiance import Field, HashField
+from refield.field.stored import occupancy_in, sampler_out
 from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.errors import InputError
 from refield.update.composite import Earlier, Origin, UpdatedField
@@ -28,7 +29,7 @@ def save_updated(folder: Path, field: UpdatedField) -> None:
     Raises:
         TypeError: the helper is no `HashField`, so there is no file for it.
     """
-    tensors: dict[str, Tensor] = {"occupancy": field.sampler.grid}
+    tensors: dict[str, Tensor] = sampler_out(field.sampler)
     facts: dict[str, Any] = {
         "architecture": "UpdatedField",
         "regions": len(field.region.grids),
@@ -82,7 +83,8 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
         unseen = tensors.get("unseen", torch.zeros(0, dtype=torch.long))  # of older visits it is not known
         if unseen.dtype != torch.long or not bool(((unseen >= 0) & (unseen < pretrained.sampler.grid.numel())).all()):
             raise ValueError("a cell that is not shown is not one of the grid's")
-        sampler = replace(pretrained.sampler, grid=tensors["occupancy"])
+        grid, fine = occupancy_in(tensors)
+        sampler = replace(pretrained.sampler, grid=grid, fine=fine)
         base, earlier = _earlier_in(tensors, facts, pretrained)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(folder, f"does not describe an updated field ({error})", _REMEDY) from None

@@ -43,7 +43,7 @@ class Sight:
         """Looks into the hidden cells alone."""
         grid = torch.zeros_like(self.sampler.grid)
         grid.view(-1)[self.hidden] = 1
-        return replace(self.sampler, grid=grid)
+        return replace(self.sampler, grid=grid, fine=None)
 
     @property
     def possible(self) -> OccupancySampler:
@@ -51,7 +51,7 @@ class Sight:
         grid = torch.ones_like(self.sampler.grid)
         seen = self.cells[self.before > _BEFORE]
         grid.view(-1)[seen] = self.sampler.grid.reshape(-1)[seen]
-        return replace(self.sampler, grid=grid)
+        return replace(self.sampler, grid=grid, fine=None)
 
 
 def sight_of(field: Field, frames: Sequence[Frame], boxes: Sequence[Tensor]) -> Sight:

@@ -80,16 +80,37 @@ def distortion(w: Tensor, s_starts: Tensor, s_ends: Tensor, offsets: Tensor) -> 
     return _twin(w).distortion(w, s_starts, s_ends, offsets)
 
 
-def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor, Tensor]:
+def march(
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, fine: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.march`."""
-    return _twin(grid).march(rays, space, grid, lattice)
+    return _twin(grid).march(rays, space, grid, lattice, fine)
 
 
 def march_visible(
-    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: DensityNet, stop: float
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    net: DensityNet,
+    stop: float,
+    fine: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.march_visible`."""
-    return _twin(grid).march_visible(rays, space, grid, lattice, net, stop)
+    return _twin(grid).march_visible(rays, space, grid, lattice, net, stop, fine)
+
+
+def render(
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    stop: float,
+    fine: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `reference.render`."""
+    return _twin(grid).render(rays, space, grid, lattice, field, stop, fine)
 
 
 def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, step: int) -> None:
@@ -110,9 +131,10 @@ def train_step(
     field: tuple[Tensor, tuple[int, ...], Networks],
     aim: Aim,
     into: list[Tensor],
+    fine: Tensor | None = None,
 ) -> Stepped:
     """See `reference.train_step`."""
-    return _twin(grid).train_step(batch, space, grid, lattice, field, aim, into)
+    return _twin(grid).train_step(batch, space, grid, lattice, field, aim, into, fine)
 
 
 def woven_step(
@@ -125,9 +147,10 @@ def woven_step(
     field: tuple[Tensor, tuple[int, ...], Networks],
     aim: Aim,
     into: list[Tensor],
+    fine: Tensor | None = None,
 ) -> Stepped:
     """See `reference.woven_step`."""
-    return _twin(grid).woven_step(batch, fixed, unwanted, space, grid, lattice, field, aim, into)
+    return _twin(grid).woven_step(batch, fixed, unwanted, space, grid, lattice, field, aim, into, fine)
 
 
 def observe(state: Tensor, now: int, decay: float, cells: Tensor, w: Tensor, sigmas: Tensor) -> None:
@@ -138,3 +161,13 @@ def observe(state: Tensor, now: int, decay: float, cells: Tensor, w: Tensor, sig
 def keep(state: Tensor, allowed: Tensor, opacity: float, weight: float, only_seen: bool) -> Tensor:
     """See `reference.keep`."""
     return _twin(state).keep(state, allowed, opacity, weight, only_seen)
+
+
+def note(known: Tensor, cells: Tensor, parts: Tensor, opaque: Tensor) -> None:
+    """See `reference.note`."""
+    _twin(known).note(known, cells, parts, opaque)
+
+
+def narrow(known: Tensor, grid: Tensor) -> Tensor:
+    """See `reference.narrow`."""
+    return _twin(known).narrow(known, grid)

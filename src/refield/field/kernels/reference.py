@@ -13,6 +13,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from refield.field.kernels.masks import marked, part_of
+from refield.field.kernels.masks import narrow as narrow
+from refield.field.kernels.masks import note as note
+
 Rays3 = tuple[Tensor, Tensor, Tensor]
 """origins (N, 3), unit directions (N, 3), jitter (N,) in [0, 1) that shifts each ray's lattice"""
 Space = tuple[Tensor, float]
@@ -64,6 +68,8 @@ class Stepped(NamedTuple):
     sigmas: Tensor
     """(S,) per world unit"""
     rays: int
+    parts: Tensor | None = None
+    """(S,) int64, which of its cell's 64 sub-cells each sample lies in, see `marked`; where it was asked"""
     shown: Tensor | None = None
     """(N, 3) what `train_step` composited, before gains, without the background"""
     errors: Tensor | None = None
@@ -100,6 +106,8 @@ class Unwanted(NamedTuple):
 
 BURNT = 254.5 / 255
 """a photo's colour above which it may have been brighter still"""
+TRACE = 0.05
+"""light that reaches a background which goes on for ever, and would move the mean distance there"""
 PRIMES = (1, 2654435761, 805459861)  # the spatial hash of Teschner et al. 2003, as in Instant-NGP, Eq. 4
 
 
@@ -225,8 +233,10 @@ def distortion(w: Tensor, s_starts: Tensor, s_ends: Tensor, offsets: Tensor) -> 
     return each.new_zeros(len(offsets) - 1).index_add(0, _ray_ids(offsets), each)
 
 
-def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor, Tensor]:
-    """Samples where ``grid`` (R, R, R) uint8 over contracted space is set.
+def march(
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, fine: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Samples where ``grid`` (R, R, R) uint8 over contracted space is set, and ``fine`` allows it: see `marked`.
 
     Steps are ``step`` long inside the core cube and times m^1.5 outside, between a pixel's growth (m) and a
     contracted cell's (m^2). Returns t_starts (S,), t_ends (S,), offsets (N + 1,).
@@ -243,8 +253,7 @@ def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Te
         m = ((x - centre) / radius).abs().amax(-1)
         dt = step * m.clamp_min(1.0) ** 1.5
         mid = x + directions[live] * (dt / 2)[:, None]
-        cell = ((contract(mid, centre, radius) + 2) * (r / 4)).long().clamp(0, r - 1)
-        hit = grid[cell[:, 0], cell[:, 1], cell[:, 2]] > 0
+        hit = marked((contract(mid, centre, radius) + 2) * (r / 4), grid, fine)
         starts.append(t[hit])
         ends.append((t + dt)[hit])
         owners.append(live[hit])
@@ -261,20 +270,54 @@ def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Te
 
 
 def march_visible(
-    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: DensityNet, stop: float
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    net: DensityNet,
+    stop: float,
+    fine: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As :func:`march`, but a ray ends after the sample in which its optical depth passes ``stop``.
 
     The density is that of a hash encoding and one hidden layer of relu, per world unit: exp(raw) / radius.
     """
     origins, directions, _ = rays
-    t0, t1, offsets = march(rays, space, grid, lattice)
+    t0, t1, offsets = march(rays, space, grid, lattice, fine)
     ids = _ray_ids(offsets)
     x = origins[ids] + directions[ids] * ((t0 + t1) / 2)[:, None]
     sigma = torch.exp(hash_density((contract(x, *space) + 2) / 4, net).clamp(max=15)) / space[1]
     keep = _exclusive_sum(sigma * (t1 - t0), offsets) < stop
     counts = torch.zeros(len(offsets) - 1, dtype=torch.long, device=ids.device).index_add(0, ids, keep.long())
     return t0[keep], t1[keep], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+
+
+def render(
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    stop: float,
+    fine: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What rays see of a hash field, without gradients: rgb (N, 3) on black, depth (N,), opacity (N,); see
+    `refield.field.volrend.Rendering`."""
+    tables, resolutions, networks = field
+    origins, directions, _ = rays
+    with torch.no_grad():
+        net = (tables, resolutions, networks[0], networks[1][0])
+        t0, t1, offsets = march_visible(rays, space, grid, lattice, net, stop, fine)
+        ids, mid = _ray_ids(offsets), (t0 + t1) / 2
+        unit = (contract(origins[ids] + directions[ids] * mid[:, None], *space) + 2) / 4
+        raw, rgbs = hash_field(unit, directions[ids], tables, resolutions, networks)
+        tau = truncated_exp(raw) / space[1] * (t1 - t0)
+        before = torch.exp(-_exclusive_sum(tau, offsets))
+        w = before * -torch.expm1(-tau)
+        lit = (before > TRACE).to(w.dtype)
+        values = torch.cat([rgbs, torch.stack([lit * mid, lit, torch.ones_like(mid)], -1)], -1)
+        summed = accumulate(w, values, offsets)
+        return summed[:, :3], summed[:, 3] / summed[:, 4].clamp_min(1e-6), summed[:, 5]
 
 
 def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, step: int) -> None:
@@ -359,6 +402,7 @@ def train_step(
     field: tuple[Tensor, tuple[int, ...], Networks],
     aim: Aim,
     into: list[Tensor],
+    fine: Tensor | None = None,
 ) -> Stepped:
     """March, evaluate, composite, compare and go back: adds d loss / d parameter to ``into`` (tables, five matrices).
 
@@ -368,7 +412,7 @@ def train_step(
     tables, resolutions, networks = field
     origins, directions, _ = batch.rays
     net = (tables.detach(), resolutions, networks[0].detach(), networks[1][0].detach())
-    t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop)
+    t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop, fine)
     ids, mid = _ray_ids(offsets), (t0 + t1) / 2
     leaves = [p.detach().requires_grad_() for p in (tables, *networks)]
     ways = [r.detach().requires_grad_(batch.moving > 0) for r in (origins, directions)]
@@ -388,8 +432,9 @@ def train_step(
     for total, grad in zip(into, grads):
         total += grad
     cells = _cells(unit.detach(), grid.shape[0])
+    parts = part_of((unit.detach() * grid.shape[0] * 4).long().clamp_(0, 4 * grid.shape[0] - 1))
     to_rays = (grads[-2][: batch.moving], grads[-1][: batch.moving]) if batch.moving else None
-    told = shown[:, :3].detach(), errors.detach(), heaviest(w.detach(), offsets), to_rays
+    told = parts, shown[:, :3].detach(), errors.detach(), heaviest(w.detach(), offsets), to_rays
     return Stepped(float(loss.detach()), cells, w.detach(), sigmas.detach(), len(offsets) - 1, *told)
 
 
@@ -425,6 +470,7 @@ def woven_step(
     field: tuple[Tensor, tuple[int, ...], Networks],
     aim: Aim,
     into: list[Tensor],
+    fine: Tensor | None = None,
 ) -> Stepped:
     """`train_step` with fixed segments between the samples (Eq. 4); they count in the loss as samples of no length.
     All photos count alike, as they are.
@@ -434,7 +480,7 @@ def woven_step(
     tables, resolutions, networks = field
     origins, directions, _ = batch.rays
     net = (tables.detach(), resolutions, networks[0].detach(), networks[1][0].detach())
-    t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop)
+    t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop, fine)
     ids, mid = _ray_ids(offsets), (t0 + t1) / 2
     x = origins[ids] + directions[ids] * mid[:, None]
     if unwanted.taken is not None:

@@ -4,11 +4,13 @@ Loops over samples or rays run in parallel; scatters run in parallel over levels
 sums are over a fixed number of groups: results are the same, bit for bit, for every thread count.
 """
 
+from refield.field.kernels.cpu.cells import narrow, note
 from refield.field.kernels.cpu.encoding import hash_encode
 from refield.field.kernels.cpu.marching import hash_density, march, march_visible
 from refield.field.kernels.cpu.networks import hash_field
 from refield.field.kernels.cpu.optimiser import adam, keep, observe, scatter_max
 from refield.field.kernels.cpu.rays import accumulate, contract, distortion, spherical_harmonics, weights
+from refield.field.kernels.cpu.rendering import render
 from refield.field.kernels.cpu.step import train_step
 from refield.field.kernels.cpu.woven import woven_step
 
@@ -23,7 +25,10 @@ __all__ = [
     "keep",
     "march",
     "march_visible",
+    "narrow",
+    "note",
     "observe",
+    "render",
     "scatter_max",
     "spherical_harmonics",
     "train_step",

@@ -7,7 +7,6 @@ network see hundreds of samples at once, and a ray stops after the wave in which
 from __future__ import annotations
 
 import math
-import weakref
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
+from refield.field.kernels.cpu.cells import BLOCKS, grids_of
 from refield.field.kernels.cpu.encoding import array, encode_part, pairs, parts_of, scratch
 from refield.field.kernels.cpu.networks import padded
 from refield.field.kernels.cpu.simd import JIT, exp, product
@@ -22,41 +22,9 @@ from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 
 _ZERO, _ONE, _TWO, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
 _BLOCK = 128  # samples whose hidden layer is held at once
-_BLOCKS, _FAR = 4, 8  # cells a side that are skipped together; the furthest that is looked for, in blocks
+_FINE = np.float32(4)  # sub-cells a side of a cell
+_BLOCK_FINE = 4 * BLOCKS  # sub-cells a side of a block that is skipped
 _ROOM = 32  # samples a ray that are made room for at first
-
-
-def _reach(grid: np.ndarray) -> np.ndarray:
-    """Per block of _BLOCKS^3 cells: chessboard distance to the next with something in it, in blocks, at most _FAR."""
-    side = -(-grid.shape[0] // _BLOCKS)
-    full = np.ascontiguousarray(np.pad(grid, (0, side * _BLOCKS - grid.shape[0])))
-    rows = full.view(np.uint32) != 0  # _BLOCKS cells of one byte
-    near = rows.reshape(side, _BLOCKS, side, _BLOCKS, side).any((1, 3)).astype(np.uint8)
-    out = np.zeros_like(near)
-    for _ in range(_FAR):
-        out += 1 - near
-        for axis in range(3):
-            here = np.moveaxis(near, axis, 0)
-            wide = here.copy()
-            np.maximum(wide[1:], here[:-1], out=wide[1:])
-            np.maximum(wide[:-1], here[1:], out=wide[:-1])
-            near = np.moveaxis(wide, 0, axis)
-    return out
-
-
-_reaches: list[tuple[Any, int, np.ndarray]] = []
-
-
-def reach(grid: Tensor) -> np.ndarray:
-    """How far rays may go without a look at the grid; kept while the grid lives and is not written to."""
-    if grid.is_inference():  # does not say when it is written to
-        return _reach(array(grid))
-    for known, version, found in _reaches:
-        if known() is grid and version == grid._version:
-            return found
-    found = _reach(array(grid))
-    _reaches[:] = [(weakref.ref(grid), grid._version, found), *_reaches[:7]]
-    return found
 
 
 @njit(forceinline=True, **JIT)
@@ -68,12 +36,14 @@ def _leave(p, inverse, size, many):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True, **JIT)
-def _next(ray, t, far, step, grid, reaches, unit):  # type: ignore[no-untyped-def]
-    """The first lattice interval at or after t whose midpoint lies in an occupied cell: (t, dt); dt = 0 if none.
+def _next(ray, t, far, step, grids, unit):  # type: ignore[no-untyped-def]
+    """The first lattice interval at or after t whose midpoint lies where something may be: (t, dt); dt = 0 if none.
 
-    ``ray``: see :func:`_start`. ``unit`` (3,) is set to the midpoint in [0, 1].
+    ``ray``: see :func:`_start`; ``grids``: see `cells.grids_of`. ``unit`` (3,) is set to the midpoint in [0, 1].
     """
+    grid, reaches, fine = grids
     r = grid.shape[0]
+    last = 4 * r - 1
     per_unit, quarter, half = np.float32(r / 4), np.float32(0.25), step * _HALF
     u0, u1, u2, v0, v1, v2 = ray[0], ray[1], ray[2], ray[3], ray[4], ray[5]
     while t < far:
@@ -91,14 +61,21 @@ def _next(ray, t, far, step, grid, reaches, unit):  # type: ignore[no-untyped-de
             x, y, z = x * k, y * k, z * k
         a, b, c = x + _TWO, y + _TWO, z + _TWO
         p, q, o = a * per_unit, b * per_unit, c * per_unit
-        i, j, l = min(max(int(p), 0), r - 1), min(max(int(q), 0), r - 1), min(max(int(o), 0), r - 1)
-        empty = reaches[i // _BLOCKS, j // _BLOCKS, l // _BLOCKS]
-        if empty == 0 and grid[i, j, l] > 0:
-            unit[0], unit[1], unit[2] = a * quarter, b * quarter, c * quarter
-            return t, dt
+        i, j, l = (
+            min(max(int(p * _FINE), 0), last),
+            min(max(int(q * _FINE), 0), last),
+            min(max(int(o * _FINE), 0), last),
+        )
+        empty = reaches[i // _BLOCK_FINE, j // _BLOCK_FINE, l // _BLOCK_FINE]
+        size, many = (np.float32(BLOCKS), np.float32(empty)) if empty > 0 else (_ONE, _ONE)
+        if empty == 0 and grid[i >> 2, j >> 2, l >> 2] > 0:
+            mask = fine[i >> 2, j >> 2, l >> 2] if len(fine) > 0 else 0
+            if mask == 0 or (mask >> (((i & 3) * 4 + (j & 3)) * 4 + (l & 3))) & 1:
+                unit[0], unit[1], unit[2] = a * quarter, b * quarter, c * quarter
+                return t, dt
+            size = quarter
         if m < _ONE:
             # lattice midpoints in what is empty are skipped; a hair is kept back for rounding
-            size, many = (np.float32(_BLOCKS), np.float32(empty)) if empty > 0 else (_ONE, _ONE)
             leave = min(
                 min(_leave(p, ray[6], size, many), _leave(q, ray[7], size, many)),
                 min(_leave(o, ray[8], size, many), (_ONE - m) * ray[9]),
@@ -109,7 +86,7 @@ def _next(ray, t, far, step, grid, reaches, unit):  # type: ignore[no-untyped-de
         elif empty > 1:
             # outside the core the lattice has to be walked, but without a look at the grid; the contraction lengthens
             # nothing by more than 4/3
-            safe = min(t + np.float32(empty - 1) * np.float32(0.75 * _BLOCKS) / per_unit * ray[9], far)
+            safe = min(t + np.float32(empty - 1) * np.float32(0.75 * BLOCKS) / per_unit * ray[9], far)
             t += dt
             while t < safe:
                 m = max(abs(u0 + v0 * t), max(abs(u1 + v1 * t), abs(u2 + v2 * t)))
@@ -143,14 +120,13 @@ def _start(rays, space, lattice, per_unit, r, ray):  # type: ignore[no-untyped-d
 
 @njit(**JIT)
 def _march_part(begin, end, rays, space, grids, lattice, t0, t1, counts):  # type: ignore[no-untyped-def]
-    grid, reaches = grids
     far, step = np.float32(lattice[1]), np.float32(lattice[2])
     ray, unit = np.empty(11, np.float32), np.empty(3, np.float32)
     for r in range(begin, end):
-        t = _start(rays, space, lattice, np.float32(grid.shape[0] / 4), r, ray)
+        t = _start(rays, space, lattice, np.float32(grids[0].shape[0] / 4), r, ray)
         found = 0
         while True:
-            t, dt = _next(ray, t, far, step, grid, reaches, unit)
+            t, dt = _next(ray, t, far, step, grids, unit)
             if dt == 0:
                 break
             if found < t0.shape[1]:
@@ -186,14 +162,17 @@ def _arrays(rays: Rays3, space: Space) -> tuple[tuple[np.ndarray, ...], tuple[np
     return tuple(array(r) for r in rays), (array(space[0].float()), np.float32(space[1]))
 
 
-def march(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor, Tensor]:
+def march(
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, fine: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.march`."""
     n, room = len(rays[0]), 64
     counts = np.empty(n, np.int64)
     arrays, place = _arrays(rays, space)
+    grids = grids_of(grid, fine)
     while True:
         t0, t1 = np.empty((n, room), np.float32), np.empty((n, room), np.float32)
-        _march(arrays, place, (array(grid), reach(grid)), lattice, t0, t1, counts)
+        _march(arrays, place, grids, lattice, t0, t1, counts)
         most = int(counts.max(initial=0))
         if most <= room:
             break
@@ -229,7 +208,6 @@ def _raw_density(features, first, n, sizes, w_in, w_out, x, hidden, raw):  # typ
 def _wave_part(begin, end, rays, space, grids, lattice, net, arena):  # type: ignore[no-untyped-def]
     """March rays ``begin : end``; the samples, wave by wave, into ``arena``. Returns how many, or -1 without room."""
     tables, resolutions, w_in, w_out, stop = net
-    grid, reaches = grids
     t0, t1, owner, unit, features = arena
     n, far, step = end - begin, np.float32(lattice[1]), np.float32(lattice[2])
     lines, t, tau = np.empty((n, 11), np.float32), np.empty(n, np.float32), np.zeros(n, np.float32)
@@ -238,7 +216,7 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, arena):  # type: ig
     raw = np.empty(_BLOCK, np.float32)
     pair_features = features.view(np.float64)
     for r in range(n):
-        t[r] = _start(rays, space, lattice, np.float32(grid.shape[0] / 4), begin + r, lines[r])
+        t[r] = _start(rays, space, lattice, np.float32(grids[0].shape[0] / 4), begin + r, lines[r])
     total, living = 0, n
     while living > 0:
         if total + living > len(t0):
@@ -246,7 +224,7 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, arena):  # type: ig
         m = 0
         for a in range(living):
             r = alive[a]
-            t[r], dt = _next(lines[r], t[r], far, step, grid, reaches, unit[total + m])
+            t[r], dt = _next(lines[r], t[r], far, step, grids, unit[total + m])
             if dt > 0:
                 t0[total + m], t1[total + m], owner[total + m] = t[r], t[r] + dt, begin + r
                 t[r] += dt
@@ -359,7 +337,15 @@ def _room(name: str, parts: int, rows: int, features: int) -> tuple[np.ndarray, 
     )
 
 
-def marched(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: DensityNet, stop: float) -> Marched:
+def marched(
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    net: DensityNet,
+    stop: float,
+    fine: Tensor | None = None,
+) -> Marched:
     """The waves, packed."""
     arrays, place = _arrays(rays, space)
     inside = (*_network(net), float(stop))
@@ -368,9 +354,10 @@ def marched(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: Dens
     parts = min(4 * get_num_threads(), n // 128 + 1)  # rays differ in length: some parts more than threads
     room = _ROOM * (n // parts + 1)
     found = np.zeros(parts, np.int64)
+    grids = grids_of(grid, fine)
     while True:
         arena = _room("waves", parts, room, width)
-        _waves(arrays, place, (array(grid), reach(grid)), lattice, inside, arena, found)
+        _waves(arrays, place, grids, lattice, inside, arena, found)
         if found.min() >= 0:
             break
         room *= 4
@@ -383,9 +370,15 @@ def marched(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: Dens
 
 
 def march_visible(
-    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, net: DensityNet, stop: float
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    net: DensityNet,
+    stop: float,
+    fine: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.march_visible`."""
-    found = marched(rays, space, grid, lattice, net, stop)
+    found = marched(rays, space, grid, lattice, net, stop, fine)
     kept = (found.t_starts.copy(), found.t_ends.copy(), found.offsets)
     return torch.from_numpy(kept[0]), torch.from_numpy(kept[1]), torch.from_numpy(kept[2])

@@ -166,12 +166,14 @@ def train_step(
     field: tuple[Tensor, tuple[int, ...], Networks],
     aim: Aim,
     into: list[Tensor],
+    fine: Tensor | None = None,
 ) -> Stepped:
     """See `reference.train_step`."""
     tables, resolutions, networks = field
     net = (tables, resolutions, networks[0], networks[1][0])
-    found = marched(batch.rays, space, grid, lattice, net, aim.stop)
-    return after_march(found, batch, space, grid.shape[0], field, aim, into)
+    found = marched(batch.rays, space, grid, lattice, net, aim.stop, fine)
+    done = after_march(found, batch, space, grid.shape[0], field, aim, into)
+    return done._replace(parts=find_parts(found.unit, grid.shape[0]))
 
 
 def after_march(
@@ -296,3 +298,19 @@ def _find_cells(unit, r, out):  # type: ignore[no-untyped-def]
         i, j, k = int(unit[s, 0] * r), int(unit[s, 1] * r), int(unit[s, 2] * r)
         i, j, k = max(min(i, r - 1), 0), max(min(j, r - 1), 0), max(min(k, r - 1), 0)
         out[s] = (i * r + j) * r + k
+
+
+def find_parts(unit: np.ndarray, resolution: int) -> Tensor:
+    """Which of its cell's 4^3 sub-cells each position (S, 3) in [0, 1] is in, (S,) int64: see `reference.marked`."""
+    parts = torch.empty(len(unit), dtype=torch.int64)
+    _find_parts(unit, resolution, parts.numpy())
+    return parts
+
+
+@njit(parallel=True, **JIT)
+def _find_parts(unit, r, out):  # type: ignore[no-untyped-def]
+    last = 4 * r - 1
+    for s in prange(len(out)):
+        i, j, k = int(unit[s, 0] * r * 4), int(unit[s, 1] * r * 4), int(unit[s, 2] * r * 4)
+        i, j, k = max(min(i, last), 0) & 3, max(min(j, last), 0) & 3, max(min(k, last), 0) & 3
+        out[s] = (i * 4 + j) * 4 + k

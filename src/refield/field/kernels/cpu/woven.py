@@ -138,11 +138,12 @@ def woven_step(
     field: tuple[Tensor, tuple[int, ...], Networks],
     aim: Aim,
     into: list[Tensor],
+    fine: Tensor | None = None,
 ) -> Stepped:
     """See `reference.woven_step`."""
     tables, resolutions, networks = field
     net = (tables, resolutions, networks[0], networks[1][0])
-    found = marched(batch.rays, space, grid, lattice, net, aim.stop)
+    found = marched(batch.rays, space, grid, lattice, net, aim.stop, fine)
     if unwanted.taken is not None and len(found.t_starts):
         t0, t1 = torch.from_numpy(found.t_starts), torch.from_numpy(found.t_ends)
         ids = torch.from_numpy(found.owners)

@@ -18,9 +18,12 @@ from refield.field.kernels.gpu.marching import march, march_visible
 from refield.field.kernels.gpu.networks import hash_density, hash_field
 from refield.field.kernels.gpu.optimiser import adam, adam_scale, descend, observe, scatter_max
 from refield.field.kernels.gpu.rays import accumulate, contract, distortion, ray_ids, spherical_harmonics, weights
+from refield.field.kernels.gpu.rendering import render
 from refield.field.kernels.gpu.step import train_step
-from refield.field.kernels.reference import (  # torch's own kernels do the one; nobody trains a helper on a GPU yet
+from refield.field.kernels.reference import (  # torch's own kernels do for those; nobody trains a helper on a GPU yet
     keep,
+    narrow,
+    note,
     woven_step,
 )
 
@@ -37,8 +40,11 @@ __all__ = [
     "keep",
     "march",
     "march_visible",
+    "narrow",
+    "note",
     "observe",
     "ray_ids",
+    "render",
     "scatter_max",
     "spherical_harmonics",
     "train_step",

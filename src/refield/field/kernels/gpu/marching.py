@@ -58,19 +58,26 @@ def _leaves(x, v, cells):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _look(t, ux, uy, uz, vx, vy, vz, grid, side, step, going):  # type: ignore[no-untyped-def]
-    """The lattice interval at ``t``: its length, whether its cell is occupied, and how far to skip if it is not."""
+def _look(t, ux, uy, uz, vx, vy, vz, grid, fine, side, step, going, FINE: tl.constexpr):  # type: ignore[no-untyped-def]
+    """The lattice interval at ``t``: its length, whether something may be at its middle, and how far to skip if not."""
     m = tl.maximum(_largest(ux + vx * t, uy + vy * t, uz + vz * t), 1.0)
     dt = step * m * tl.sqrt(m)
     t = t + dt / 2
     x, y, z = ux + vx * t, uy + vy * t, uz + vz * t
     cx, cy, cz = _contracted(x, y, z)
     cells = side / 4
-    i = tl.minimum(tl.maximum(((cx + 2) * cells).to(tl.int32), 0), side - 1)
-    j = tl.minimum(tl.maximum(((cy + 2) * cells).to(tl.int32), 0), side - 1)
-    k = tl.minimum(tl.maximum(((cz + 2) * cells).to(tl.int32), 0), side - 1)
-    full = tl.load(grid + (i * side + j) * side + k, mask=going, other=0) > 0
-    # all lattice midpoints inside an empty cell of the core can be skipped; one is kept back for rounding
+    i = tl.minimum(tl.maximum(((cx + 2) * cells * 4).to(tl.int32), 0), 4 * side - 1)
+    j = tl.minimum(tl.maximum(((cy + 2) * cells * 4).to(tl.int32), 0), 4 * side - 1)
+    k = tl.minimum(tl.maximum(((cz + 2) * cells * 4).to(tl.int32), 0), 4 * side - 1)
+    cell = ((i >> 2) * side + (j >> 2)) * side + (k >> 2)
+    full = tl.load(grid + cell, mask=going, other=0) > 0
+    if FINE:
+        mask = tl.load(fine + cell, mask=going & full, other=0)
+        bit = (((i & 3) * 4 + (j & 3)) * 4 + (k & 3)).to(tl.int64)
+        closed = full & (mask != 0) & (((mask >> bit) & 1) == 0)
+        full = full & ~closed
+        cells = tl.where(closed, cells * 4, cells)
+    # all lattice midpoints inside an empty cell (or part) of the core can be skipped; one is kept back for rounding
     leaves = tl.minimum(_leaves(x, vx, cells), tl.minimum(_leaves(y, vy, cells), _leaves(z, vz, cells)))
     m = _largest(x, y, z)
     core = (1 - m) / (step * tl.maximum(_largest(vx, vy, vz), 1e-20)) - 1
@@ -79,15 +86,15 @@ def _look(t, ux, uy, uz, vx, vy, vz, grid, side, step, going):  # type: ignore[n
 
 
 @triton.jit
-def _count(origins, directions, jitter, centre, radius, near, far, step, grid, side, counts, n,  # type: ignore[no-untyped-def]
-           BLOCK: tl.constexpr):  # fmt: skip
+def _count(origins, directions, jitter, centre, radius, near, far, step, grid, fine, side, counts, n,  # type: ignore[no-untyped-def]
+           FINE: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     ux, uy, uz, vx, vy, vz = _lane(origins, directions, centre, radius, r, r < n)
     t = near + tl.load(jitter + r, mask=r < n, other=0.0) * step
     found = tl.zeros((BLOCK,), tl.int32)
     going = (r < n) & (t < far)
     while tl.max(going.to(tl.int32), 0) > 0:
-        dt, full, skip = _look(t, ux, uy, uz, vx, vy, vz, grid, side, step, going)
+        dt, full, skip = _look(t, ux, uy, uz, vx, vy, vz, grid, fine, side, step, going, FINE)
         found += (going & full).to(tl.int32)
         t = tl.where(going, t + (skip + dt), t)
         going = going & (t < far)
@@ -95,8 +102,8 @@ def _count(origins, directions, jitter, centre, radius, near, far, step, grid, s
 
 
 @triton.jit
-def _fill(origins, directions, jitter, centre, radius, near, far, step, grid, side, offsets, t0, t1, n,  # type: ignore[no-untyped-def]
-          BLOCK: tl.constexpr):  # fmt: skip
+def _fill(origins, directions, jitter, centre, radius, near, far, step, grid, fine, side, offsets, t0, t1, n,  # type: ignore[no-untyped-def]
+          FINE: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip
     """Each ray's first samples, as many as its offsets leave room for."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     ux, uy, uz, vx, vy, vz = _lane(origins, directions, centre, radius, r, r < n)
@@ -105,7 +112,7 @@ def _fill(origins, directions, jitter, centre, radius, near, far, step, grid, si
     end = tl.load(offsets + r + 1, mask=r < n, other=0)
     going = (at < end) & (t < far)
     while tl.max(going.to(tl.int32), 0) > 0:
-        dt, full, skip = _look(t, ux, uy, uz, vx, vy, vz, grid, side, step, going)
+        dt, full, skip = _look(t, ux, uy, uz, vx, vy, vz, grid, fine, side, step, going, FINE)
         tl.store(t0 + at, t, mask=going & full)
         tl.store(t1 + at, t + dt, mask=going & full)
         at += (going & full).to(tl.int64)
@@ -114,9 +121,9 @@ def _fill(origins, directions, jitter, centre, radius, near, far, step, grid, si
 
 
 @triton.jit
-def _count_visible(origins, directions, jitter, centre, radius, near, far, step, grid, side,  # type: ignore[no-untyped-def]
+def _count_visible(origins, directions, jitter, centre, radius, near, far, step, grid, fine, side,  # type: ignore[no-untyped-def]
                    tables, levels, size, w_in, w_out, stop, counts, n, L: tl.constexpr, LP: tl.constexpr,
-                   H: tl.constexpr, HP: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip
+                   H: tl.constexpr, HP: tl.constexpr, FINE: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip
     """Each lane goes on to its next occupied interval; then all lanes have their densities looked up together."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     ux, uy, uz, vx, vy, vz = _lane(origins, directions, centre, radius, r, r < n)
@@ -131,7 +138,7 @@ def _count_visible(origins, directions, jitter, centre, radius, near, far, step,
     while tl.max(going.to(tl.int32), 0) > 0:
         seeking = going
         while tl.max(seeking.to(tl.int32), 0) > 0:
-            dt, full, skip = _look(t, ux, uy, uz, vx, vy, vz, grid, side, step, seeking)
+            dt, full, skip = _look(t, ux, uy, uz, vx, vy, vz, grid, fine, side, step, seeking, FINE)
             length = tl.where(seeking & full, dt, length)
             t = tl.where(seeking & ~full, t + (skip + dt), t)
             seeking = seeking & ~full & (t < far)
@@ -147,10 +154,16 @@ def _count_visible(origins, directions, jitter, centre, radius, near, far, step,
     tl.store(counts + r, found.to(tl.int64), mask=r < n)
 
 
-def _walk(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice) -> tuple[Any, ...]:
-    """What every walk takes: rays, space, lattice, grid and its side."""
+def _walk(rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, fine: Tensor | None) -> tuple[Any, ...]:
+    """What every walk takes: rays, space, lattice, grid, masks (the grid in their place if there are none), side."""
     arrays = (r.detach().float().contiguous() for r in rays)
-    return *arrays, space[0].float().contiguous(), float(space[1]), *map(float, lattice), grid.contiguous(), len(grid)
+    place = (space[0].float().contiguous(), float(space[1]))
+    grid = grid.contiguous()
+    return *arrays, *place, *map(float, lattice), grid, grid if fine is None else fine.contiguous(), len(grid)
+
+
+def _masked(walk: tuple[Any, ...]) -> bool:
+    return walk[-2] is not walk[-3]
 
 
 def _filled(walk: tuple[Any, ...], counts: Tensor, capacity: int | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -162,21 +175,27 @@ def _filled(walk: tuple[Any, ...], counts: Tensor, capacity: int | None) -> tupl
     else:
         offsets.clamp_(max=capacity)
     t0, t1 = walk[0].new_zeros(capacity), walk[0].new_zeros(capacity)
-    _fill[(triton.cdiv(n, _RAYS["BLOCK"]),)](*walk, offsets, t0, t1, n, **_RAYS)
+    _fill[(triton.cdiv(n, _RAYS["BLOCK"]),)](*walk, offsets, t0, t1, n, FINE=_masked(walk), **_RAYS)
     return t0, t1, offsets
 
 
 def march(
-    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, *, capacity: int | None = None
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    fine: Tensor | None = None,
+    *,
+    capacity: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.march`.
 
     With a ``capacity`` nothing is asked of the device: t_starts and t_ends are (capacity,), zeros where unused, and
     rays beyond it get fewer samples or none.
     """
-    walk, n = _walk(rays, space, grid, lattice), len(rays[0])
+    walk, n = _walk(rays, space, grid, lattice, fine), len(rays[0])
     counts = torch.empty(n, dtype=torch.int64, device=grid.device)
-    _count[(triton.cdiv(n, _RAYS["BLOCK"]),)](*walk, counts, n, **_RAYS)
+    _count[(triton.cdiv(n, _RAYS["BLOCK"]),)](*walk, counts, n, FINE=fine is not None, **_RAYS)
     return _filled(walk, counts, capacity)
 
 
@@ -187,17 +206,18 @@ def march_visible(
     lattice: Lattice,
     net: DensityNet,
     stop: float,
+    fine: Tensor | None = None,
     *,
     capacity: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.march_visible`, and :func:`march` for the capacity."""
     tables, resolutions, w_in, w_out = net
-    walk, n, size, width = _walk(rays, space, grid, lattice), len(rays[0]), tables.shape[1], len(w_out)
+    walk, n, size, width = _walk(rays, space, grid, lattice, fine), len(rays[0]), tables.shape[1], len(w_out)
     counts = torch.empty(n, dtype=torch.int64, device=grid.device)
     levels = level_table(tuple(resolutions), size, grid.device)
     matrices = (w_in.detach().contiguous(), w_out.detach().contiguous(), float(stop))
     shape = density_shape(len(resolutions), width)
     _count_visible[(triton.cdiv(n, _SEEING["BLOCK"]),)](
-        *walk, words(tables), levels, size, *matrices, counts, n, **shape, **_SEEING
+        *walk, words(tables), levels, size, *matrices, counts, n, **shape, FINE=fine is not None, **_SEEING
     )
     return _filled(walk, counts, capacity)

@@ -29,6 +29,7 @@ def train_step(
     field: tuple[Tensor, tuple[int, ...], Networks],
     aim: Aim,
     into: list[Tensor],
+    fine: Tensor | None = None,
     *,
     capacity: int | None = None,
 ) -> Stepped:
@@ -40,7 +41,7 @@ def train_step(
     tables, resolutions, networks = field
     origins, directions, _ = batch.rays
     net = (tables.detach(), resolutions, networks[0].detach(), networks[1][0].detach())
-    t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop, capacity=capacity)
+    t0, t1, offsets = march_visible(batch.rays, space, grid, lattice, net, aim.stop, fine, capacity=capacity)
     ids, mid = ray_ids(offsets, len(t0)), (t0 + t1) / 2
     d = directions[ids]
     whole = torch.ones_like(offsets[1:]) if capacity is None else offsets[1:] < capacity
@@ -67,7 +68,7 @@ def train_step(
     cells = (ijk[:, 0] * side + ijk[:, 1]) * side + ijk[:, 2]
     w, sigmas, loss = w.detach(), sigmas.detach(), loss.detach()
     to_rays = (grads[-2][: batch.moving], grads[-1][: batch.moving]) if batch.moving else None
-    told = shown[:, :3].detach(), errors.detach(), None, to_rays
+    told = None, shown[:, :3].detach(), errors.detach(), None, to_rays
     if capacity is None:
         return Stepped(float(loss), cells, w, sigmas, len(offsets) - 1, *told)
     real = torch.arange(capacity, device=w.device) < offsets[-1]
