@@ -43,6 +43,9 @@ def refined(capture: Capture, path: Path) -> Capture:
     entries = read_json(path).get("frames")
     if not isinstance(entries, dict):
         raise InputError(path, "holds no frames", "train again")
+    strange = entries.keys() - {f.name for f in capture.frames}
+    if strange:
+        raise InputError(path, f"does not describe the photos ({min(strange)} is none of them)", "train again")
     try:
         frames = tuple(_refined(f, entries[f.name]) if f.name in entries else f for f in capture.frames)
     except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
