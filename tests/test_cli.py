@@ -217,10 +217,18 @@ def test_ctrl_c_leaves_no_workspace(place, monkeypatch, capsys):
     def interrupted(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("refield.commands.train.fit_field", interrupted)
+    monkeypatch.setattr("refield.commands.train.fit_capture", interrupted)
     assert main(["train", "data", "out", *TINY_FIT]) == 130
     assert "interrupted" in capsys.readouterr().err
     assert not (place / "out").exists()
+
+
+def test_what_a_fit_finds_of_its_photos_is_kept_and_told(place, capsys):
+    assert main(["train", "data", "out", *TINY_FIT, "--fit.photos.poses"]) == 0
+    assert "of the photos: poses moved by" in " ".join(capsys.readouterr().err.split())
+    given, found = Workspace(place / "out").given_capture(), Workspace(place / "out").capture()
+    assert any(not a.world_from_cam.equal(b.world_from_cam) for a, b in zip(given.train, found.train))
+    assert all(a.world_from_cam.equal(b.world_from_cam) for a, b in zip(given.held_out, found.held_out))
 
 
 def test_a_fit_that_breaks_down_keeps_its_last_good_state_and_says_so(place, monkeypatch, capsys):
@@ -242,7 +250,7 @@ def test_faults_of_ours_keep_their_traceback(place, monkeypatch):
     def broken(*args):
         raise RuntimeError("a fault")
 
-    monkeypatch.setattr("refield.commands.train.fit_field", broken)
+    monkeypatch.setattr("refield.commands.train.fit_capture", broken)
     with pytest.raises(RuntimeError, match="a fault"):
         main(["train", "data", "out", *TINY_FIT])
     assert not (place / "out").exists()

@@ -207,7 +207,10 @@ class Workspace:
 
     def keep_refined(self, given: Capture, found: Capture) -> None:
         """Note what the fit found out about the photos of the capture kept here, see `refield.scene.refined`."""
-        write_refined(self.path / "capture" / REFINED, given, found)
+        # the photos have names of their own here
+        names = {f.name: kept.name for f, kept in zip(given.frames, self.given_capture().frames)}
+        parts = (replace(c, frames=tuple(replace(f, name=names[f.name]) for f in c.frames)) for c in (given, found))
+        write_refined(self.path / "capture" / REFINED, *parts)
 
     def keep_field(self, field: HashField | NerfactoField, psnr: float = math.nan) -> None:
         """Write the fitted field and, if known, its PSNR on held-out pixels (dB)."""

@@ -15,7 +15,7 @@ from refield.scene.capture import Capture
 from refield.scene.errors import InputError
 from refield.scene.exposure import Exposure
 from refield.scene.images import frame_image
-from refield.scene.refined import refined, write_refined
+from refield.scene.refined import in_words, refined, write_refined
 from tests.captures import CAMERA, write_capture
 
 DARKENED = Exposure((0.8, 1.0, 1.25), (-0.3, 0.05, -0.1))
@@ -81,6 +81,17 @@ def test_nothing_found_leaves_no_file(given: Capture, tmp_path: Path) -> None:
     assert refined(given, tmp_path / "refined.json") is given
 
 
+def test_one_line_says_what_was_found(given: Capture) -> None:
+    assert in_words(given, given) == ""
+    said = in_words(given, found_of(given))
+    exposures, poses, lenses = said.split("; ")
+    assert exposures == "exposures differ by up to 0.0 stops"  # one alone is known, and its gains cancel out
+    assert poses.startswith("poses moved by ") and 1 < float(poses.split()[3]) < 3
+    assert lenses == "focal lengths changed by up to 3.8 %"
+    lit = [replace(f, exposure=Exposure((g, g, g))) for f, g in zip(given.frames, (1.0, 0.5, 1.2, 1.0))]
+    assert in_words(given, replace(given, frames=tuple(lit))) == "exposures differ by up to 2.8 stops"
+
+
 def broken(entry: dict[str, Any]) -> list[Any]:
     camera, exposure = entry["camera"], entry["exposure"]
     return [
@@ -109,6 +120,9 @@ def test_a_damaged_file_is_refused(given: Capture, tmp_path: Path) -> None:
         path.write_text(json.dumps({"frames": {name: entry}}))
         with pytest.raises(InputError, match=r"does not describe the photos|is not valid JSON"):
             refined(given, path)
+    path.write_text(json.dumps({"frames": {"another.png": sound}}))
+    with pytest.raises(InputError, match="another"):
+        refined(given, path)
     path.write_text('{"frames": 3}')
     with pytest.raises(InputError, match="holds no frames"):
         refined(given, path)

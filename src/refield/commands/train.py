@@ -22,6 +22,7 @@ from refield.photos.sources import find_sources
 from refield.scene.capture import Capture, centres
 from refield.scene.errors import InputError
 from refield.scene.load import is_posed, load_capture
+from refield.scene.refined import in_words
 from refield.scene.world import world_of
 from refield.workspace import Workspace
 
@@ -126,6 +127,8 @@ def train(
         clock.stage("keep the field")
         workspace.keep_field(fitted, line.psnr)
         workspace.keep_refined(capture, found)
+        if said := in_words(capture, found):
+            clock.console.print(f"           of the photos: {said}", markup=False)
     clock.stop()
     return line.psnr
 

@@ -114,11 +114,7 @@ class Fitted:
     """with the photos' exposures, poses and lenses as the fit found them, where it was to find them"""
 
 
-# While exposures are found, colours do not depend on where they are seen from: each photo has directions of its own,
-# by which a field would learn its exposure. Of the harmonics' 16 columns in the colours' first matrix one stays, the
-# constant's.
-_PLAIN = 0.5  # of the fit
-_COLOUR_IN, _DIRECTED = 3, 15
+_COLOUR_IN, _DIRECTED = 3, 15  # which parameter takes in directions, and in how many columns, but for a constant
 ProgressCallback = Callable[[FitProgress], None]
 StepCallback = Callable[[int, HashField], None]
 """Hears how many steps are done and the field as they left it, in training; it is not to change it."""
@@ -197,7 +193,11 @@ def _new_field(capture: Capture, config: FitConfig, seed: int) -> HashField:
     # the same time. On real photographs a third as long cost 2 dB.
     cells = max(2 / shape.finest, 0.5 / RESOLUTION)
     grid = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.uint8)
-    return HashField(shape, OccupancySampler(contraction, grid, 4 * contraction.radius * cells), seed)
+    model = HashField(shape, OccupancySampler(contraction, grid, 4 * contraction.radius * cells), seed)
+    if config.photos.exposures:  # see `PhotoModel.plain`
+        with torch.no_grad():
+            model.networks[_COLOUR_IN - 1][:, -_DIRECTED:] = 0
+    return model
 
 
 def _opened(start: HashField) -> HashField:
@@ -318,9 +318,7 @@ class _Fit:
         self.pixels, self.judge = photos.bank(), photos.judge()
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model)
-        if self.photos.unlike:
-            with torch.no_grad():
-                self.adam.parameters[_COLOUR_IN][:, -_DIRECTED:] = 0
+        self.plain = not self.adam.parameters[_COLOUR_IN][:, -_DIRECTED:].any()
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
@@ -392,7 +390,7 @@ class _Fit:
         where = (space, sampler.grid, sampler.lattice)
         done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, fine=sampler.fine)
         rate = rate_factor((1 + progress) / 2 if self.goes_on else progress)
-        if self.photos.unlike and progress < _PLAIN:
+        if self.plain and self.photos.plain(progress):
             self.adam.grads[_COLOUR_IN][:, -_DIRECTED:] = 0
         if self.adam.step(self.config.rate * rate, done.loss):
             self.loss = done.loss if math.isnan(self.loss) else self.loss + 0.03 * (done.loss - self.loss)

@@ -23,6 +23,9 @@ from refield.scene.capture import Capture, Frame
 from refield.scene.exposure import Exposure
 
 _EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.1, 0.25, 0.1  # of a fit: what is asked of it must be there first
+# So far into a fit that finds exposures, colours do not depend on where they are seen from: each photo has directions
+# of its own, by which a field would learn its exposure.
+_PLAIN = 0.5
 _PLACES = 16  # where rays end, a side of the contracted cube
 _MOVING = 4  # every so-many-th ray tells how poses are wrong
 
@@ -31,11 +34,10 @@ _MOVING = 4  # every so-many-th ray tells how poses are wrong
 class PhotoModelConfig:
     """What a fit finds out about its photos."""
 
-    exposures: bool | None = None
-    """exposure and white balance of each photo, vignetting of each camera, where they differ; by default as the quality
-    says, and not without one"""
-    poses: bool | None = None
-    """where each photo was taken and what its lens is, a few pixels around what is given; by default the same"""
+    exposures: bool = False
+    """exposure and white balance of each photo, vignetting of each camera"""
+    poses: bool = False
+    """where each photo was taken and what its lens is, a few pixels around what is given"""
     trust: bool = False
     """parts of single photos that show what no other does count for less"""
 
@@ -67,17 +69,16 @@ class PhotoModel:
         self.poses = PoseFit(frames, float(distance)) if config.poses else None
         self.trust = PhotoTrust(bank, places) if config.trust else None
 
-    @property
-    def unlike(self) -> bool:
-        """Whether the photos may have been exposed differently, for all that is known."""
-        return self.exposures is not None and (self.exposing or not self._asked_whether)
-
     def may_expose(self, progress: float) -> bool:
         """Whether now, once in a fit, is to be found out if the photos' exposures differ at all: gains of photos that
         were exposed alike would take up what the field does not show yet."""
         now = self.exposures is not None and not self._asked_whether and progress >= _EXPOSED_FROM
         self._asked_whether |= now
         return now
+
+    def plain(self, progress: float) -> bool:
+        """Whether colours are not to depend on where they are seen from yet, lest the field learn the exposures."""
+        return self.exposures is not None and progress < (_PLAIN if self.exposing else _EXPOSED_FROM)
 
     def ask(self, pixels: Tensor, progress: float) -> Asked:
         """Rays of pixels (N,) as they stand, with the photos' gains and trust; ``progress`` of the fit in [0, 1]."""

@@ -1,6 +1,7 @@
 """How much a fit does: a field as large as its photos can fill, for as long as its quality asks.
 
-Small captures are fitted by the smallest of all, whatever is asked: more would learn nothing from them.
+Small captures are fitted by the smallest of all, whatever is asked: more would learn nothing from them, and poses that
+follow a coarse field's errors come out worse than they were.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ def sized(config: FitConfig, frames: Sequence[Frame], quality: Quality) -> FitCo
         samples=samples,
         sharpen=large if config.sharpen is None else config.sharpen,
         field=_with(config.field, shape),
-        photos=_with(config.photos, PhotoModelConfig(exposures=True, poses=True)),
+        photos=_with(config.photos, PhotoModelConfig(exposures=large, poses=large)),
     )
 
 

@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from refield.scene.camera import Camera
-from refield.scene.capture import Capture, Frame
+from refield.scene.capture import Capture, Frame, centres
 from refield.scene.errors import InputError
 from refield.scene.exposure import Exposure
 from refield.scene.files import read_json, write_json
+from refield.scene.pose import invert, transform
 
 NAME = "refined.json"
 
@@ -41,11 +43,42 @@ def refined(capture: Capture, path: Path) -> Capture:
     entries = read_json(path).get("frames")
     if not isinstance(entries, dict):
         raise InputError(path, "holds no frames", "train again")
+    strange = entries.keys() - {f.name for f in capture.frames}
+    if strange:
+        raise InputError(path, f"does not describe the photos ({min(strange)} is none of them)", "train again")
     try:
         frames = tuple(_refined(f, entries[f.name]) if f.name in entries else f for f in capture.frames)
     except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise InputError(path, f"does not describe the photos ({error})", "train again") from None
     return replace(capture, frames=frames)
+
+
+def in_words(given: Capture, found: Capture) -> str:
+    """One line: in what the frames of ``found`` differ from those of ``given``, which are of the same names; "" if in
+    nothing."""
+    before = {f.name: f for f in given.frames}
+    pairs = [(before[f.name], f) for f in found.frames]
+    stops = [f.exposure.stops for _, f in pairs if f.exposure is not None]
+    said = []
+    if any(f.exposure != g.exposure for g, f in pairs):
+        said.append(f"exposures differ by up to {max(stops) - min(stops):.1f} stops")
+    moved = [(g, f) for g, f in pairs if not torch.equal(g.world_from_cam, f.world_from_cam)]
+    if moved:
+        far = (centres(given.frames) - centres(given.frames).mean(0)).norm(dim=-1).median()
+        pixels = torch.stack([_moved(g, f, float(far)) for g, f in moved]).median()
+        said.append(f"poses moved by {float(pixels):.1f} pixels (median)")
+    focal = max(abs(f.camera.fx / g.camera.fx - 1) for g, f in pairs)
+    if any(f.camera != g.camera for g, f in pairs):
+        said.append(f"focal lengths changed by up to {100 * focal:.1f} %")
+    return "; ".join(said)
+
+
+def _moved(given: Frame, found: Frame, depth: float) -> Tensor:
+    """By how many pixels four points of the picture, that far away, move with the pose, ()."""
+    c = given.camera
+    pixels = torch.tensor([[x * c.width, y * c.height] for x in (0.25, 0.75) for y in (0.25, 0.75)]).double()
+    points = transform(given.world_from_cam, c.unproject(pixels) * depth)
+    return (c.project(transform(invert(found.world_from_cam), points))[0] - pixels).norm(dim=-1).mean()
 
 
 def _entry(given: Frame, found: Frame) -> dict[str, Any]:
