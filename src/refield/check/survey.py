@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ import torch
 from refield.check.coverage import Coverage, coverage_of
 from refield.field.fit import FitConfig
 from refield.field.memory import Memory, memory_fault, memory_of
+from refield.field.quality import Quality, sized
 from refield.photos.features import photo_features
 from refield.photos.gather import Gathered
 from refield.photos.lens import Lens
@@ -29,7 +31,7 @@ FEW, TOO_FEW = 30, 3
 _SPREAD = 1.0  # stops, from which on exposure is spoken of
 _GAP, _SEEN = 120.0, 3.0
 _SIFT_HERE = 1.1  # seconds a megapixel, on the machine that the rest was measured on: 2 cores of a Xeon
-_PER_PAIR, _PER_POSE, _PER_STEP = 0.035, 0.12, 0.0085  # seconds there
+_PER_PAIR, _PER_POSE, _PER_SAMPLE, _PER_ENTRY = 0.035, 0.12, 0.9e-6, 1.9e-9  # seconds there
 
 
 @dataclass(frozen=True)
@@ -60,11 +62,11 @@ class Survey:
 
 def survey_capture(
     capture: Capture,
-    config: FitConfig,
+    asked: tuple[FitConfig, Quality],
     left_out: Sequence[tuple[str, str]] = (),
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Survey:
-    """Look over photos with poses."""
+    """Look over photos with poses, that are to be fitted as ``asked``."""
     looks, rate = [], []
     for i, frame in enumerate(capture.frames):
         image = read_image(frame.path).numpy()
@@ -73,10 +75,10 @@ def survey_capture(
             rate.append(_seconds_per_megapixel(image))
         if on_progress is not None:
             on_progress(i + 1, len(capture.frames))
-    world = world_of(capture)
+    world, config = world_of(capture), sized(asked[0], capture.train, asked[1])
     coverage, memory = coverage_of(capture, world), memory_of(capture, config)
     sizes = Counter((f.camera.width, f.camera.height) for f in capture.frames)
-    seconds = {"fit": config.steps * _PER_STEP * _slowness(rate)}
+    seconds = {"fit": _fit_seconds(config, _slowness(rate))}
     names = tuple(f.name for f in capture.frames)
     faults = [*_too_little(len(names)), *_memory(memory), *_one_place(capture)]
     advice = [*_photo_advice(names, looks), *_coverage_advice(coverage)]
@@ -86,19 +88,26 @@ def survey_capture(
     )  # fmt: skip
 
 
-def survey_photos(gathered: Gathered, config: FitConfig, motion: MotionConfig) -> Survey:
-    """Look over photos without poses; where they were taken takes longer to find than this."""
+def survey_photos(gathered: Gathered, asked: tuple[FitConfig, Quality], motion: MotionConfig) -> Survey:
+    """Look over photos without poses, to be fitted as ``asked``; where they were taken takes longer to find than this."""
     photos = gathered.photos
-    memory = memory_of(Capture(tuple(_unplaced(p) for p in photos)), config)
+    capture = Capture(tuple(_unplaced(p) for p in photos))
+    config = sized(asked[0], capture.train, asked[1])
+    memory = memory_of(capture, config)
     names, looks = tuple(p.name for p in photos), [p.look for p in photos]
     rate = [_seconds_per_megapixel(pixels_of(p)) for p in photos[:3]]
     lenses: set[tuple[Lens, int, int]] = {(p.lens, p.width, p.height) for p in photos}
     seconds = _motion_seconds(photos, motion, _slowness(rate))
-    seconds["fit"] = config.steps * _PER_STEP * _slowness(rate)
+    seconds["fit"] = _fit_seconds(config, _slowness(rate))
     return Survey(
         names, tuple(looks), Counter((p.width, p.height) for p in photos), len(lenses), gathered.left_out, memory,
         seconds, faults=(*_too_little(len(photos)), *_memory(memory)), advice=tuple(_photo_advice(names, looks)),
     )  # fmt: skip
+
+
+def _fit_seconds(config: FitConfig, slowness: float) -> float:
+    step = _PER_SAMPLE * config.samples + _PER_ENTRY * config.field.levels * 2**config.field.log2_table
+    return min(config.steps * step * slowness, config.max_seconds or math.inf)
 
 
 def _unplaced(photo: Taken) -> Frame:

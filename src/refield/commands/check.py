@@ -15,6 +15,7 @@ from refield.check.picture import camera_picture
 from refield.check.survey import Survey, survey_capture, survey_photos, told
 from refield.commands.clock import Clock, results
 from refield.field.fit import FitConfig
+from refield.field.quality import OPEN, Quality
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
 from refield.photos.gather import gather
 from refield.photos.look import stops, usual_sharpness
@@ -37,8 +38,10 @@ class Check:
     """where the picture of the cameras around the points goes"""
     poses: FromPhotosConfig = field(default_factory=FromPhotosConfig)
     """photos without poses: how they are taken in, and how their poses are found"""
-    fit: FitConfig = field(default_factory=FitConfig)
-    """what would be fitted, for its memory and time"""
+    quality: Quality = "good"
+    """of the fit, for its memory and time"""
+    fit: FitConfig = OPEN
+    """what would be fitted"""
 
 
 def run(options: Check) -> None:
@@ -78,18 +81,18 @@ def check(options: Check, clock: Clock) -> Survey:
         with Workspace.caching(options.work) as cache, clock.counters() as counting:
             found = capture_from_photos(options.data, cache, options.poses, warn=_silent, counting=counting)
             clock.stage("look at the photos")
-            return survey_capture(found.capture, options.fit, found.left_out, counting("photos"))
+            return survey_capture(found.capture, (options.fit, options.quality), found.left_out, counting("photos"))
     clock.stage("look at the photos")
     with tempfile.TemporaryDirectory(prefix="refield-") as folder, clock.counters() as counting:
         gathered = gather(options.data, Path(folder), options.poses.photos, counting("photos"))
-        return survey_photos(gathered, options.fit, options.poses.motion)
+        return survey_photos(gathered, (options.fit, options.quality), options.poses.motion)
 
 
 def _posed(options: Check, clock: Clock, *, workspace: bool = False) -> Survey:
     clock.stage("look at the photos")
     capture = Workspace.open(options.data).capture() if workspace else load_capture(options.data, warn=clock.warn)
     with clock.counters() as counting:
-        return survey_capture(capture, options.fit, (), counting("photos"))
+        return survey_capture(capture, (options.fit, options.quality), (), counting("photos"))
 
 
 def _silent(message: str) -> None:

@@ -43,7 +43,8 @@ def placed_photos(
     """
     find_sources(folder)  # nothing is made for the sake of photos that are not there
     clock.stage("localize")
-    capture, cache = workspace.capture(), workspace.cache
+    # as given: what is known of the photos' landmarks is of those poses
+    capture, cache = workspace.given_capture(), workspace.cache
     with clock.counters() as counting:
         taken = take_in(folder, cache, how.intake, counting)
         if check is not None:

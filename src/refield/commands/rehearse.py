@@ -8,7 +8,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,6 +22,7 @@ from refield.commands.train import Sources, train
 from refield.commands.update import Update, Visit, update
 from refield.evaluate import Report
 from refield.field.fit import FitConfig
+from refield.field.quality import OPEN, Quality
 from refield.rehearse.compose import Scenery, compose, divided, scenery_of
 from refield.rehearse.plan import NoRoomError
 from refield.rehearse.score import ChangeScore, score_change
@@ -51,7 +52,9 @@ class Rehearse:
     """an empty folder for the photos, workspaces and numbers of the rehearsals; without it only the table is told"""
     placed: bool = True
     """the new photos come with their poses; --no-placed has them placed by what they show, as photos of your own are"""
-    fit: FitConfig = field(default_factory=FitConfig)
+    quality: Quality = "draft"
+    """of the rehearsed fits, as `refield train` has it"""
+    fit: FitConfig = OPEN
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ def run(options: Rehearse) -> None:
     seeds, clock = seeds_of(options.seeds), Clock()
     if options.out is not None:
         _refuse_unless_free(options.work, options.out)
-    scenery, size = prepared(options.work, clock, options.fit, len(seeds))
+    scenery, size = prepared(options.work, clock, (options.fit, options.quality), len(seeds))
     done: list[Rehearsed] = []
     try:
         with _folder(options.out) as folder:
@@ -125,7 +128,7 @@ def _rehearse_all(
             clock.console.print(f"           {k} of {len(seeds)} rehearsed, about {_time(left)} left")
 
 
-def prepared(work: Path, clock: Clock, fit: FitConfig, count: int) -> tuple[Scenery, float]:
+def prepared(work: Path, clock: Clock, asked: tuple[FitConfig, Quality], count: int) -> tuple[Scenery, float]:
     """A workspace as a scenery, and how large its world is; tells how long the rehearsals will take.
 
     Raises:
@@ -134,7 +137,7 @@ def prepared(work: Path, clock: Clock, fit: FitConfig, count: int) -> tuple[Scen
     workspace = opened(work)
     capture = workspace.capture()
     divided(capture)
-    seconds = sum(survey_capture(capture, fit).seconds.values())
+    seconds = sum(survey_capture(capture, asked).seconds.values())
     each = f"each about one training (some {_time(seconds)} on this machine) and one update"
     clock.console.print(f"{count} rehearsals, {each}; Ctrl-C leaves nothing half done", markup=False)
     clock.stage("find out how far off things are")
@@ -164,7 +167,7 @@ def rehearsed(scenery: Scenery, folder: Path, seed: int, clock: Clock, options: 
     data, work = folder / "data", folder / "work"
     with writable(folder), clock.counting("photos") as tell:
         compose(scenery, data, seed, tell)
-    psnr = train(Sources(data / "before", work), clock, options.fit, overwrite=False)
+    psnr = train(Sources(data / "before", work), clock, options.fit, overwrite=False, quality=options.quality)
     photos = data / "after" if options.placed else data / "after" / "images"
     visit: Visit | None = None
     refused = ""

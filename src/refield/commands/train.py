@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,7 +18,7 @@ from refield.field.photo_size import sizes_told
 from refield.field.quality import OPEN, Quality, sized
 from refield.field.radiance import HashField
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
-from refield.photos.landmarks import Landmarks, write_landmarks
+from refield.photos.landmarks import Landmarks, read_landmarks, write_landmarks
 from refield.photos.sources import find_sources
 from refield.scene.capture import Capture, centres
 from refield.scene.errors import InputError
@@ -146,22 +147,26 @@ def train_more(work: Path, clock: Clock, config: FitConfig, quality: Quality) ->
     if not isinstance(field, HashField):
         raise InputError(work, f"holds a field of the kind {type(field).__name__}", "train anew")
     config = sized(config, capture.train, quality)
-    with workspace.writing():
-        clock.stage(f"go on with the fit to {len(capture.train)} photos")
-        _tell(capture, config, memory_of(capture, replace(config, field=field.config)), clock)
-        before = workspace.held_out_psnr()
-        with clock.training("fit") as line:
-            done = fit_capture(capture, config, line, start=field, goes_on=True)
-        if line.psnr < before:
-            clock.warn(
-                f"{line.psnr:.2f} dB on held-out photos is no better than the {before:.2f} of before, which stays"
-            )
-        else:
-            clock.stage("keep the field")
-            workspace.keep_field(done.field, line.psnr)
-            workspace.keep_refined(workspace.given_capture(), done.capture)
+    clock.stage(f"go on with the fit to {len(capture.train)} photos")
+    _tell(capture, config, memory_of(capture, replace(config, field=field.config)), clock)
+    before = workspace.held_out_psnr()
+    with clock.training("fit") as line:
+        done = fit_capture(capture, config, line, start=field, goes_on=True)
+    if line.psnr < before:
+        clock.warn(f"no better on held-out photos ({line.psnr:.2f} dB, before {before:.2f}): what was there stays")
+    else:
+        clock.stage("keep the field")
+        given = workspace.given_capture()
+        landmarks = read_landmarks(workspace.landmarks, given)
+        with Workspace.building(work, overwrite=True, made_by=Workspace.made_by(work) or "train") as renewed:
+            renewed.keep_capture(given)
+            renewed.keep_world(workspace.world())
+            if landmarks is not None:
+                write_landmarks(renewed.landmarks, landmarks)
+            renewed.keep_field(done.field, line.psnr)
+            renewed.keep_refined(given, done.capture)
     clock.stop()
-    return max(line.psnr, before) if before == before else line.psnr
+    return max(line.psnr, before) if math.isfinite(before) else line.psnr
 
 
 def _tell(capture: Capture, config: FitConfig | NerfactoFitConfig, needed: Memory, clock: Clock) -> None:
