@@ -400,3 +400,14 @@ def test_photos_alone_all_the_way(reconstructed, tmp_path, monkeypatch, capsys):
 def believe_photos(capture, field, frames, config, on_stage=None, models=None, known=()):
     """Nothing changed, and all photos were used."""
     return SceneChange(photos=tuple(PlacedPhoto(f.name, "used", frame=f) for f in frames))
+
+
+def test_a_fit_goes_on_from_where_it_stood(place, capsys):
+    assert main(["train", "data", "out", *TINY_FIT]) == 0
+    first = json.loads((place / "out/field/field.json").read_text())
+    assert main(["train", "out", "--more", *TINY_FIT]) == 0
+    second = json.loads((place / "out/field/field.json").read_text())
+    assert second["held_out_psnr"] >= first["held_out_psnr"]
+    assert main(["train", "data"]) == 2
+    assert "name the folder in which to make the workspace" in " ".join(capsys.readouterr().err.split())
+    assert main(["train", "data", "--more"]) == 2  # no workspace

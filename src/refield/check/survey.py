@@ -89,7 +89,7 @@ def survey_capture(
 
 
 def survey_photos(gathered: Gathered, asked: tuple[FitConfig, Quality], motion: MotionConfig) -> Survey:
-    """Look over photos without poses, to be fitted as ``asked``; where they were taken takes longer to find than this."""
+    """Look over photos without poses, to be fitted as ``asked``; where they were taken takes longer to find."""
     photos = gathered.photos
     capture = Capture(tuple(_unplaced(p) for p in photos))
     config = sized(asked[0], capture.train, asked[1])

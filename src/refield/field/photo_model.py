@@ -34,10 +34,11 @@ _MOVING = 4  # every so-many-th ray tells how poses are wrong
 class PhotoModelConfig:
     """What a fit finds out about its photos."""
 
-    exposures: bool = False
-    """exposure and white balance of each photo, vignetting of each camera"""
-    poses: bool = False
-    """where each photo was taken and what its lens is, a few pixels around what is given"""
+    exposures: bool | None = None
+    """exposure and white balance of each photo, vignetting of each camera, where they differ; by default as the quality
+    says, and not without one"""
+    poses: bool | None = None
+    """where each photo was taken and what its lens is, a few pixels around what is given; by default the same"""
     trust: bool = False
     """parts of single photos that show what no other does count for less"""
 
