@@ -94,6 +94,11 @@ class NonFiniteError(RuntimeError):
 class _StuckError(RuntimeError):
     """What the fit has built before the cameras hides the scene, and nothing behind it learns any more."""
 
+    def __init__(self, left_out: float) -> None:
+        super().__init__()
+        self.left_out = left_out
+        """PSNR of photos that are left out, dB"""
+
 
 # Some fits of a scene with a repeating texture, seen from all around, end in foam before the cameras: a few in a
 # hundred, of some captures most. Another seed does not. Foam is photos learnt by heart: those that are left out gain
@@ -161,8 +166,10 @@ def fit_capture(
     """
     capture, since = as_read(capture, since, config.size)
     began, photos = time.perf_counter(), Photos.of(capture, since, most_pixels(config))
+    left_out: list[float] = []  # of each fit that was given up
     for attempt in range(_TRIES):
-        seed = config.seed + attempt
+        # the last one is the best of those before, to its end
+        seed = config.seed + (attempt if attempt < _TRIES - 1 else left_out.index(max(left_out)))
         torch.manual_seed(seed)
         model = _new_field(capture, config, seed) if start is None else _opened(start)
         try:
@@ -175,7 +182,8 @@ def fit_capture(
                 run.run(may_give_up)
                 found = run.photos.told(capture, run.judge, model)
             break
-        except _StuckError:
+        except _StuckError as error:
+            left_out.append(error.left_out)
             continue
         except NonFiniteError as error:
             error.field = model.eval().requires_grad_(False)
@@ -355,7 +363,7 @@ class _Fit:
             if self.on_step:
                 self.on_step(step + 1, self.model)
             if may_give_up and self._stuck() and self._progress(0) < _LATE:
-                raise _StuckError
+                raise _StuckError(self.judge.psnr(self.model, self.photos.exposing))
             if (step + 1) % self.config.check_every == 0:
                 looks.append(self._look(step + 1))
                 if at_plateau(looks, self.config):
