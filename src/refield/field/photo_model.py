@@ -37,8 +37,8 @@ class PhotoModelConfig:
     exposures: bool | None = None
     """exposure and white balance of each photo, vignetting of each camera, where they differ; by default as the quality
     says, and not without one"""
-    poses: bool | None = None
-    """where each photo was taken and what its lens is, a few pixels around what is given; by default the same"""
+    poses: bool = False
+    """where each photo was taken and what its lens is, a few pixels around what is given"""
     trust: bool = False
     """parts of single photos that show what no other does count for less"""
 

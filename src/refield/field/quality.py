@@ -65,7 +65,7 @@ def sized(config: FitConfig, frames: Sequence[Frame], quality: Quality) -> FitCo
         samples=samples,
         sharpen=large if config.sharpen is None else config.sharpen,
         field=_with(config.field, shape),
-        photos=_with(config.photos, PhotoModelConfig(exposures=large, poses=False)),
+        photos=_with(config.photos, PhotoModelConfig(exposures=large)),
     )
 
 
