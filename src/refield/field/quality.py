@@ -57,10 +57,12 @@ def sized(config: FitConfig, frames: Sequence[Frame], quality: Quality) -> FitCo
         width=64 if large else usual.field.width,
     )
     samples = config.samples or (2 * usual.samples if large else usual.samples)
-    steps = max(usual.steps * usual.samples, effort.samples_per_pixel * pixels) / samples
+    steps = config.steps or round(max(usual.steps * usual.samples, effort.samples_per_pixel * pixels) / samples)
     return replace(
         config,
-        steps=config.steps or round(steps),
+        steps=steps,
+        # half of the fit, as usual: while the learning rate is high, looks go up and down by more than they gain
+        patience=max(config.patience, steps // (2 * config.check_every)),
         max_seconds=config.max_seconds or effort.seconds,
         samples=samples,
         sharpen=large if config.sharpen is None else config.sharpen,
