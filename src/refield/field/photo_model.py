@@ -128,7 +128,7 @@ class PhotoModel:
 
     def inform(self, judge: HeldOut) -> None:
         """Tell the judge what has become known of the cameras."""
-        if self.exposures is None and self.poses is None:
+        if not self.exposing and self.poses is None:
             return
         lenses = self._lenses()
         fallen = [self._vignetting(f.camera) for f in judge.frames]

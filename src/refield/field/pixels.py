@@ -9,6 +9,7 @@ from torch import Tensor
 
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays
+from refield.scene.exposure import vignetting_basis
 from refield.scene.images import frame_image
 
 DIRECTIONS_MOST = 1 << 29  # bytes; camera-space directions are kept for every pixel of every distinct camera up to here
@@ -89,11 +90,9 @@ class PixelBank:
 
     def vignetting_basis(self, pixels: Tensor, owner: Tensor) -> Tensor:
         """`refield.scene.exposure.vignetting_basis` at pixels (B,) of photos ``owner`` (B,), (B, 3)."""
-        local = self._place_of(pixels, owner)
-        width, height = (side[self._camera_of[owner]] for side in self._sizes.T)
-        x, y = (local % width + 0.5) - width / 2, (local // width + 0.5) - height / 2
-        square = (x * x + y * y) / ((width / 2) ** 2 + (height / 2) ** 2)
-        return torch.stack([square, square**2, square**3], -1)
+        local, size = self._place_of(pixels, owner), self._sizes[self._camera_of[owner]]
+        width = size[:, 0]
+        return vignetting_basis(torch.stack([local % width, local // width], -1) + 0.5, size)
 
     def colours(self, pixels: Tensor) -> Tensor:
         """(B,) -> (B, 3) float32 in [0, 1]."""

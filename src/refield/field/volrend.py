@@ -16,7 +16,7 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.kernels.cpu.simd import JIT
-from refield.field.kernels.reference import TRACE
+from refield.field.kernels.reference import seen, to_be_seen
 from refield.scene.capture import Rays
 
 _Samples = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
@@ -85,12 +85,8 @@ def accumulate_rgb(w: Tensor, rgbs: Tensor, samples: Samples) -> tuple[Tensor, T
 def composite(sigmas: Tensor, rgbs: Tensor, samples: Samples) -> Rendering:
     """Eq. 1: sigmas (S,), rgbs (S, 3) -> Rendering of N rays, differentiable."""
     w = weights(sigmas, samples)
-    mid = (samples.t_starts + samples.t_ends) / 2
-    before = w / -torch.expm1(-sigmas * (samples.t_ends - samples.t_starts)).clamp(max=-1e-9)  # transmittance
-    lit = (before > TRACE).to(w.dtype)
-    values = torch.cat([rgbs, torch.stack([lit * mid, lit, torch.ones_like(mid)], -1)], -1)
-    summed = kernels.accumulate(w, values, samples.ray_offsets)
-    return Rendering(summed[:, :3], summed[:, 3] / summed[:, 4].clamp_min(1e-6), summed[:, 5])
+    values = to_be_seen(w, sigmas, rgbs, samples.t_starts, samples.t_ends)
+    return Rendering(*seen(kernels.accumulate(w, values, samples.ray_offsets)))
 
 
 def interleaved(a: Samples, b: Samples) -> Samples:

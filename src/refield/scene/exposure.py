@@ -42,7 +42,8 @@ class Exposure:
     def factor(self, camera: Camera) -> Tensor:
         """By how much the photo differs from neutral at every pixel, (H, W, 3) float32."""
         shape = camera.height, camera.width, 1
-        fallen = vignetting_basis(camera.pixel_centres(), camera) @ torch.tensor(self.vignetting)
+        basis = vignetting_basis(camera.pixel_centres(), torch.tensor([camera.width, camera.height]))
+        fallen = basis @ torch.tensor(self.vignetting)
         return fallen.exp().reshape(shape) * torch.tensor(self.gains)
 
     def neutral(self, image: Tensor, camera: Camera) -> Tensor:
@@ -55,8 +56,8 @@ class Exposure:
         return (neutral * self.factor(camera).to(neutral)).clamp(0, 1)
 
 
-def vignetting_basis(uv: Tensor, camera: Camera) -> Tensor:
-    """r^2, r^4 and r^6 at pixels (N, 2), (N, 3) float32."""
-    middle = torch.tensor([camera.width / 2, camera.height / 2])
-    square = (uv.float() - middle).square().sum(-1) / middle.square().sum()
+def vignetting_basis(uv: Tensor, size: Tensor) -> Tensor:
+    """r^2, r^4 and r^6, (N, 3) float32, at pixels (N, 2) of photos of the width and height ``size``, (2,) or (N, 2)."""
+    middle = size / 2
+    square = (uv.float() - middle).square().sum(-1) / middle.square().sum(-1)
     return torch.stack([square, square**2, square**3], -1)

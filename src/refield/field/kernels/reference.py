@@ -311,13 +311,22 @@ def render(
         ids, mid = _ray_ids(offsets), (t0 + t1) / 2
         unit = (contract(origins[ids] + directions[ids] * mid[:, None], *space) + 2) / 4
         raw, rgbs = hash_field(unit, directions[ids], tables, resolutions, networks)
-        tau = truncated_exp(raw) / space[1] * (t1 - t0)
-        before = torch.exp(-_exclusive_sum(tau, offsets))
-        w = before * -torch.expm1(-tau)
-        lit = (before > TRACE).to(w.dtype)
-        values = torch.cat([rgbs, torch.stack([lit * mid, lit, torch.ones_like(mid)], -1)], -1)
-        summed = accumulate(w, values, offsets)
-        return summed[:, :3], summed[:, 3] / summed[:, 4].clamp_min(1e-6), summed[:, 5]
+        sigmas = truncated_exp(raw) / space[1]
+        w = weights(sigmas, t0, t1, offsets)
+        return seen(accumulate(w, to_be_seen(w, sigmas, rgbs, t0, t1), offsets))
+
+
+def to_be_seen(w: Tensor, sigmas: Tensor, rgbs: Tensor, t_starts: Tensor, t_ends: Tensor) -> Tensor:
+    """What a picture sums up along rays, of samples with weights (S,), (S, 6); see :func:`seen`."""
+    mid = (t_starts + t_ends) / 2
+    before = w / -torch.expm1(-sigmas * (t_ends - t_starts)).clamp(max=-1e-9)  # transmittance
+    lit = (before > TRACE).to(w.dtype)
+    return torch.cat([rgbs, torch.stack([lit * mid, lit, torch.ones_like(mid)], -1)], -1)
+
+
+def seen(summed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sums (N, 6) -> rgb (N, 3) on black, depth (N,), opacity (N,)."""
+    return summed[:, :3], summed[:, 3] / summed[:, 4].clamp_min(1e-6), summed[:, 5]
 
 
 def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, step: int) -> None:

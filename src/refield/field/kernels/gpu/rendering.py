@@ -8,7 +8,7 @@ from torch import Tensor
 from refield.field.kernels.gpu.marching import march_visible
 from refield.field.kernels.gpu.networks import hash_field
 from refield.field.kernels.gpu.rays import accumulate, contract, ray_ids, weights
-from refield.field.kernels.reference import TRACE, Lattice, Networks, Rays3, Space, truncated_exp
+from refield.field.kernels.reference import Lattice, Networks, Rays3, Space, seen, to_be_seen, truncated_exp
 
 
 def render(
@@ -30,8 +30,4 @@ def render(
         raw, rgbs = hash_field((contract(rays[0][ids] + d * mid[:, None], *space) + 2) / 4, d, *field)
         sigmas = truncated_exp(raw) / space[1]
         w = weights(sigmas, t0, t1, offsets)
-        before = w / -torch.expm1(-sigmas * (t1 - t0)).clamp(max=-1e-9)
-        lit = (before > TRACE).to(w.dtype)
-        values = torch.cat([rgbs, torch.stack([lit * mid, lit, torch.ones_like(mid)], -1)], -1)
-        summed = accumulate(w, values, offsets)
-        return summed[:, :3], summed[:, 3] / summed[:, 4].clamp_min(1e-6), summed[:, 5]
+        return seen(accumulate(w, to_be_seen(w, sigmas, rgbs, t0, t1), offsets))
