@@ -15,11 +15,12 @@ import torch
 from benchmarks.record import Report, Row, forget_peaks, median, one_line, peak_memory
 from refield.field import fit_nerfacto, gpu_fit, graphed
 from refield.field.coverage import knowable
-from refield.field.fit import FitConfig, FitProgress, _finest_for, place_contraction
+from refield.field.fit import FitConfig, FitProgress
 from refield.field.fit_nerfacto import NerfactoFitConfig
 from refield.field.gpu_fit import move
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
 from refield.field.photos import Photos
+from refield.field.placing import finest_for, place_contraction
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import CHUNK, render_camera, render_many, visible_samples
 from refield.field.sampling import OccupancySampler
@@ -41,7 +42,7 @@ def new_model(capture: Capture, config: FitConfig, device: torch.device) -> Hash
     """As `fit_field` begins, still on the CPU; with a coarse grid if it stays there."""
     torch.manual_seed(config.seed)
     space = place_contraction(capture)
-    shape = replace(config.field, finest=_finest_for(capture.train, space, config.field.log2_table))
+    shape = replace(config.field, finest=finest_for(capture.train, space, config.field.log2_table))
     if not config.finest_auto:
         shape = config.field
     step = max(8 * space.radius / shape.finest, space.radius / 192)

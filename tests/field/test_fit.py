@@ -13,19 +13,18 @@ import torch
 from PIL import Image
 
 from refield.field import kernels
+from refield.field.descent import MOST_SKIPPED, NonFiniteError
 from refield.field.fit import (
-    MOST_SKIPPED,
     FitConfig,
     FitProgress,
-    NonFiniteError,
     _Fit,
     fit_field,
-    place_contraction,
     rate_factor,
 )
 from refield.field.memory import memory_of
 from refield.field.photos import HeldOut, Photos, Since
 from refield.field.pixels import PixelBank
+from refield.field.placing import place_contraction
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_frame
 from refield.scene.camera import Camera

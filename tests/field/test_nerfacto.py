@@ -14,8 +14,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from refield.field import fit_nerfacto as fitting
+from refield.field.descent import NonFiniteError
 from refield.field.encoding import Contraction
-from refield.field.fit import FitProgress, NonFiniteError
+from refield.field.fit import FitProgress
 from refield.field.fit_nerfacto import NerfactoFitConfig, fit_nerfacto, proposal_interval, rate_at
 from refield.field.interlevel import bounds, interlevel_loss
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere

@@ -10,10 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from refield.field.fit import FitConfig, FitProgress, Fitted, _Fit, _new_field, fit_capture
+from refield.field.fit import FitConfig, FitProgress, Fitted, _Fit, fit_capture
 from refield.field.kernels.reference import Batch, Stepped
 from refield.field.photo_model import PhotoModelConfig
 from refield.field.photos import HeldOut, Photos
+from refield.field.placing import new_field
 from refield.field.poses import PoseFit
 from refield.field.radiance import HashFieldConfig
 from refield.field.render import render_frame
@@ -225,7 +226,7 @@ def test_strangers_are_not_trusted_and_not_shown(plain: Plain, tmp_path: Path) -
 def _run(capture: Capture, photos: Photos) -> _Fit:
     """A fit with trust that has run."""
     config = replace(TINY, steps=600, photos=PhotoModelConfig(trust=True))
-    fit = _Fit(_new_field(capture, config, 0), photos, config, None, None)
+    fit = _Fit(new_field(capture, config, 0), photos, config, None, None)
     fit.run()
     fit.model.eval().requires_grad_(False)
     return fit

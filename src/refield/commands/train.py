@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from refield.commands.clock import Clock
-from refield.field.fit import FitConfig, NonFiniteError, ProgressCallback, fit_capture
+from refield.field.descent import NonFiniteError
+from refield.field.fit import FitConfig, ProgressCallback, fit_capture
 from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig, fit_nerfacto
 from refield.field.memory import Memory, memory_fault, memory_of
 from refield.field.nerfacto import NerfactoField

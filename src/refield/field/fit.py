@@ -9,20 +9,20 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
-from torch import Tensor
 
 from refield.field import kernels
 from refield.field.compiling import Compiling, compiling
 from refield.field.coverage import knowable
-from refield.field.encoding import Contraction, large_zeros
+from refield.field.descent import NonFiniteError, TableAdam
 from refield.field.kernels.reference import Aim
 from refield.field.occupancy import OccupancyTrainer
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
 from refield.field.photo_size import PhotoSizeConfig, as_read, at_full_size
 from refield.field.photos import UNCHANGED, Photos, Since
+from refield.field.placing import COLOUR_IN, DIRECTED, new_field, opened
 from refield.field.radiance import HashField, HashFieldConfig
-from refield.field.sampling import RESOLUTION, STOP, OccupancySampler
-from refield.scene.capture import Capture, Frame
+from refield.field.sampling import STOP
+from refield.scene.capture import Capture
 from refield.scene.errors import InputError
 
 
@@ -82,15 +82,6 @@ class FitProgress:
     seconds_left: float
 
 
-class NonFiniteError(RuntimeError):
-    """The loss or its gradient stayed infinite or NaN for too long."""
-
-    field: HashField | None = None
-    """the last good state, ready for use, where :func:`fit_field` raises this"""
-    steps: int = 0
-    """that were taken before"""
-
-
 class _StuckError(RuntimeError):
     """What the fit has built before the cameras hides the scene, and nothing behind it learns any more."""
 
@@ -119,11 +110,9 @@ class Fitted:
     """with the photos' exposures, poses and lenses as the fit found them, where it was to find them"""
 
 
-_COLOUR_IN, _DIRECTED = 3, 15  # which parameter takes in directions, and in how many columns, but for a constant
 ProgressCallback = Callable[[FitProgress], None]
 StepCallback = Callable[[int, HashField], None]
 """Hears how many steps are done and the field as they left it, in training; it is not to change it."""
-MOST_SKIPPED = 20  # steps in a row
 COARSEST = 1.5  # times the final step along the ray
 
 
@@ -171,7 +160,7 @@ def fit_capture(
         # the last one is the best of those before, to its end
         seed = config.seed + (attempt if attempt < _TRIES - 1 else left_out.index(max(left_out)))
         torch.manual_seed(seed)
-        model = _new_field(capture, config, seed) if start is None else _opened(start)
+        model = new_field(capture, config, seed) if start is None else opened(start)
         try:
             if config.device == "cuda":
                 _fit_on_gpu(model, photos, config, on_progress, on_step)
@@ -191,30 +180,6 @@ def fit_capture(
     return Fitted(model.eval().requires_grad_(False), at_full_size(found))
 
 
-def _new_field(capture: Capture, config: FitConfig, seed: int) -> HashField:
-    """Random weights, in the shape and the place that suit the photos."""
-    contraction = place_contraction(capture)
-    shape = config.field
-    if config.finest_auto:
-        shape = replace(shape, finest=_finest_for(capture.train, contraction, shape.log2_table))
-    # About two pixels, but half a cell of the occupancy grid at least: with more samples a ray fewer rays are seen in
-    # the same time. On real photographs a third as long cost 2 dB.
-    cells = max(2 / shape.finest, 0.5 / RESOLUTION)
-    grid = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.uint8)
-    model = HashField(shape, OccupancySampler(contraction, grid, 4 * contraction.radius * cells), seed)
-    if config.photos.exposures:  # see `PhotoModel.plain`
-        with torch.no_grad():
-            model.networks[_COLOUR_IN - 1][:, -_DIRECTED:] = 0
-    return model
-
-
-def _opened(start: HashField) -> HashField:
-    """A copy of a field that looks everywhere, its weights free: things may have come to where nothing was."""
-    model = HashField.from_state(*start.state()).requires_grad_(True)
-    model.looking_where(torch.ones_like(model.sampler.grid))
-    return model
-
-
 def _fit_on_gpu(
     model: HashField,
     photos: Photos,
@@ -229,83 +194,9 @@ def _fit_on_gpu(
     fit_on_gpu(model, photos, config, on_progress, on_step)
 
 
-def place_contraction(capture: Capture) -> Contraction:
-    """Where the core cube goes: around what the cameras look at, reaching half-way to them.
-
-    The centre is the least-squares meeting point of the optical axes, held to what the cameras have before them where
-    the axes hardly meet (a forward-facing capture): the points of the reconstruction, or else their own spread.
-    """
-    centres = torch.stack([f.centre for f in capture.frames])
-    axes = torch.stack([f.world_from_cam[:3, 2] for f in capture.frames])
-    eye = torch.eye(3, dtype=torch.float64)
-    across = eye - axes[:, :, None] * axes[:, None, :]
-    spread = (centres - centres.mean(0)).norm(dim=-1).mean().clamp_min(1e-6)
-    ahead = _depth_of_points(capture, centres, axes)
-    guess = (centres + axes * (spread if ahead is None else ahead)).mean(0)
-    hold = 1e-3 * len(centres)
-    centre = torch.linalg.solve(across.sum(0) + hold * eye, (across @ centres[:, :, None]).sum(0)[:, 0] + hold * guess)
-    if ahead is not None and float(((centre - centres) * axes).sum(-1).median()) < 0.3 * ahead:
-        centre = guess  # the axes cross by chance, among the cameras or behind them
-    distance = (centres - centre).norm(dim=-1).median()
-    return Contraction(centre.float(), float(distance) * 0.6)
-
-
-def _depth_of_points(capture: Capture, centres: Tensor, axes: Tensor, most: int = 5000) -> Tensor | None:
-    """How far before the cameras the reconstruction's points usually lie; None without points."""
-    points = capture.points[:: max(1, len(capture.points) // most)].double()
-    depths = ((points[None] - centres[:, None]) * axes[:, None]).sum(-1)
-    return depths[depths > 0].median() if len(points) >= 20 and (depths > 0).any() else None
-
-
-def _finest_for(frames: tuple[Frame, ...], contraction: Contraction, log2_table: int) -> int:
-    """Cells a side so that the finest is about a pixel wide where the axes meet, within what a table can hold.
-
-    A surface crosses about n^2 of a level's n^3 cells. Past n = 2.5 sqrt(entries) collisions cost more than detail
-    gives: on real photographs 1253 cells came out 1.8 dB below 600 at 2^16 entries.
-    """
-    distances = torch.stack([(f.centre.float() - contraction.centre).norm() / f.camera.fx for f in frames])
-    wanted = 4 * contraction.radius / float(distances.median())
-    return int(min(max(wanted, 256), 2.5 * 2 ** (log2_table / 2)))
-
-
 def most_pixels(config: FitConfig) -> int | None:
     """How many pixels are kept of photos that do not fit into ``photo_memory``: 3 bytes each, and 4 for its place."""
     return None if config.photo_memory is None else max(int(config.photo_memory * 1e9 / 7), 1)
-
-
-class TableAdam:
-    """Adam for a hash field: what has no gradient rests, in the tables as in the matrices."""
-
-    def __init__(self, model: HashField) -> None:
-        self.parameters = [model.encoding.tables, *model.networks]
-        self.grads = [large_zeros(*p.shape) for p in self.parameters]
-        """where a step's gradients are added up; cleared by :meth:`step`"""
-        self.first, self.second = ([large_zeros(*p.shape) for p in self.parameters] for _ in range(2))
-        self.count = 0
-        self.left_out = 0
-        """steps since the last that was taken"""
-
-    def step(self, rate: float, loss: float) -> bool:
-        """Take the step if the loss and its gradients are finite; else leave it out, and count it.
-
-        Raises:
-            NonFiniteError: that was the 20th in a row; the parameters are as the last sound step left them.
-        """
-        # a gradient that is not finite shows in the networks', through which all of it has gone
-        if not math.isfinite(loss) or not all(bool(g.isfinite().all()) for g in self.grads[1:]):
-            self.left_out += 1
-            for grad in self.grads:
-                grad.zero_()
-            if self.left_out >= MOST_SKIPPED:
-                error = NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
-                error.steps = self.count
-                raise error
-            return False
-        self.count, self.left_out = self.count + 1, 0
-        with torch.no_grad():
-            for p, grad, first, second in zip(self.parameters, self.grads, self.first, self.second):
-                kernels.adam(p, grad, first, second, rate, self.count)
-        return True
 
 
 class _Fit:
@@ -326,7 +217,7 @@ class _Fit:
         self.pixels, self.judge = photos.bank(), photos.judge()
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model)
-        self.plain = not self.adam.parameters[_COLOUR_IN][:, -_DIRECTED:].any()
+        self.plain = not self.adam.parameters[COLOUR_IN][:, -DIRECTED:].any()
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
@@ -399,7 +290,7 @@ class _Fit:
         done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, fine=sampler.fine)
         rate = rate_factor((1 + progress) / 2 if self.goes_on else progress)
         if self.plain and self.photos.plain(progress):
-            self.adam.grads[_COLOUR_IN][:, -_DIRECTED:] = 0
+            self.adam.grads[COLOUR_IN][:, -DIRECTED:] = 0
         if self.adam.step(self.config.rate * rate, done.loss):
             self.loss = done.loss if math.isnan(self.loss) else self.loss + 0.03 * (done.loss - self.loss)
             parts = done.parts if self.config.sharpen else None

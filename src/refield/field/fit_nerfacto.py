@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 from refield.field import kernels
-from refield.field.fit import MOST_SKIPPED, FitProgress, NonFiniteError, ProgressCallback, place_contraction
+from refield.field.descent import MOST_SKIPPED, NonFiniteError
+from refield.field.fit import FitProgress, ProgressCallback
 from refield.field.interlevel import interlevel_loss
 from refield.field.losses import colour_loss, scale_gradients
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
 from refield.field.photos import HeldOut
 from refield.field.pixels import PixelBank
+from refield.field.placing import place_contraction
 from refield.field.proposal import Histogram, annealing
 from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples, accumulate_rgb, weights

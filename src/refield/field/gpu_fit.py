@@ -8,13 +8,12 @@ from dataclasses import replace
 import torch
 
 from refield.field.coverage import knowable
+from refield.field.descent import MOST_SKIPPED, NonFiniteError
 from refield.field.encoding import Contraction
 from refield.field.fit import (
     COARSEST,
-    MOST_SKIPPED,
     FitConfig,
     FitProgress,
-    NonFiniteError,
     ProgressCallback,
     StepCallback,
     at_plateau,

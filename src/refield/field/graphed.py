@@ -51,7 +51,7 @@ class DevicePixels:
 
 
 class Descent:
-    """`fit.TableAdam` on a device: rate, count and the guard against bad steps are tensors.
+    """`descent.TableAdam` on a device: rate, count and the guard against bad steps are tensors.
 
     A step whose loss or gradient is not finite leaves everything as it was; ``bad`` counts such steps in a row.
     """

@@ -50,7 +50,7 @@ def sized(config: FitConfig, frames: Sequence[Frame], quality: Quality) -> FitCo
     pixels, effort, usual = sum(f.camera.width * f.camera.height for f in frames), _EFFORTS[quality], FitConfig()
     log2 = config.field.log2_table or _log2_table(pixels, effort)
     large = log2 > usual.field.log2_table
-    finest = 2.5 * 2 ** (log2 / 2)  # see `fit._finest_for`
+    finest = 2.5 * 2 ** (log2 / 2)  # see `placing.finest_for`
     shape = HashFieldConfig(
         levels=max(round(1 + math.log(finest / usual.field.coarsest) / math.log(_GROWTH)), usual.field.levels),
         log2_table=log2,

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from refield.field import kernels
-from refield.field.fit import NonFiniteError, TableAdam, rate_factor
+from refield.field.descent import NonFiniteError, TableAdam
+from refield.field.fit import rate_factor
 from refield.field.kernels.reference import Aim, Batch, Fixed, Unwanted
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP
