@@ -22,10 +22,15 @@ class NonFiniteError(RuntimeError):
     """that were taken before"""
 
 
+FADE_EVERY = 16  # steps: to go through the whole of large tables costs as much as Adam
+
+
 class TableAdam:
     """Adam for a hash field: what has no gradient rests, in the tables as in the matrices."""
 
-    def __init__(self, model: HashField) -> None:
+    def __init__(self, model: HashField, decay: float = 0.0) -> None:
+        """``decay``: see `fading`."""
+        self.decay = decay
         self.parameters = [model.encoding.tables, *model.networks]
         self.grads = [large_zeros(*p.shape) for p in self.parameters]
         """where a step's gradients are added up; cleared by :meth:`step`"""
@@ -54,4 +59,12 @@ class TableAdam:
         with torch.no_grad():
             for p, grad, first, second in zip(self.parameters, self.grads, self.first, self.second):
                 kernels.adam(p, grad, first, second, rate, self.count)
+            if self.decay and self.count % FADE_EVERY == 0:
+                self.parameters[0].mul_(fading(self.decay, rate))
         return True
+
+
+def fading(decay: float, rate: float) -> float:
+    """What tables are multiplied by every `FADE_EVERY` steps: decoupled weight decay, times the learning rate. Entries
+    that rays seldom ask would keep what they were told in passing, and entries that are asked follow more quickly."""
+    return max(1 - FADE_EVERY * decay * rate, 0.0)

@@ -14,12 +14,13 @@ from refield.field import kernels
 from refield.field.compiling import Compiling, compiling
 from refield.field.coverage import knowable
 from refield.field.descent import NonFiniteError, TableAdam
+from refield.field.encoding import Contraction
 from refield.field.kernels.reference import Aim
 from refield.field.occupancy import OccupancyTrainer
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
 from refield.field.photo_size import PhotoSizeConfig, as_read, at_full_size
 from refield.field.photos import UNCHANGED, Photos, Since
-from refield.field.placing import COLOUR_IN, DIRECTED, new_field, opened
+from refield.field.placing import COLOUR_IN, DIRECTED, around, new_field, opened, place_contraction
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.sampling import STOP
 from refield.scene.capture import Capture
@@ -40,6 +41,8 @@ class FitConfig:
     """the lattice along the ray is made coarser, up to 1.5 times, while a ray needs more than this"""
     rate: float = 2e-2
     """Adam's learning rate, held for the first half, then brought down to a thirtieth"""
+    decay: float | None = None
+    """of the tables' entries, times the learning rate; by default as the quality says, none without one"""
     distortion: float = 1e-2
     """weight of the distortion loss; without it fog fills the grid"""
     gradient_unit: float = 1.0
@@ -54,6 +57,9 @@ class FitConfig:
     """choose ``field.finest`` from the photos' resolution"""
     check_every: int = 250
     """steps between looks at the held-out pixels"""
+    look_around: bool | None = None
+    """fit a small field first, so that the core takes in what the photos show; by default as the quality says, not
+    without one"""
     sharpen: bool | None = None
     """leave out, in training, the parts of cells that are no more than haze: surfaces become sharp and rays short. Of
     few or small photos it makes a field that knows them by heart; by default as the quality says, not without one"""
@@ -155,12 +161,13 @@ def fit_capture(
     """
     capture, since = as_read(capture, since, config.size)
     began, photos = time.perf_counter(), Photos.of(capture, since, most_pixels(config))
+    core = _core(capture) if start is None and config.look_around else None
     left_out: list[float] = []  # of each fit that was given up
     for attempt in range(_TRIES):
         # the last one is the best of those before, to its end
         seed = config.seed + (attempt if attempt < _TRIES - 1 else left_out.index(max(left_out)))
         torch.manual_seed(seed)
-        model = new_field(capture, config, seed) if start is None else opened(start)
+        model = new_field(capture, config, seed, core) if start is None else opened(start)
         try:
             if config.device == "cuda":
                 _fit_on_gpu(model, photos, config, on_progress, on_step)
@@ -178,6 +185,22 @@ def fit_capture(
             error.field = model.eval().requires_grad_(False)
             raise
     return Fitted(model.eval().requires_grad_(False), at_full_size(found))
+
+
+# Enough to tell how far away things are: twice as many samples tell the same, half as many steps up to a quarter less
+_FIRST_LOOK = FitConfig(steps=300, samples=4096, check_every=1000, field=HashFieldConfig(log2_table=14))
+_LOOKED_AT = 1e6  # pixels
+
+
+def _core(capture: Capture) -> Contraction:
+    """Where the core goes, going by a first look at the photos, or, where that leads nowhere, by the cameras alone."""
+    core, frames = place_contraction(capture), capture.train
+    pixels = sum(f.camera.width * f.camera.height for f in frames)
+    size = PhotoSizeConfig(min((_LOOKED_AT / pixels) ** 0.5, 1.0))
+    try:
+        return around(core, fit_field(Capture(frames, capture.points, 0), replace(_FIRST_LOOK, size=size)), frames)
+    except NonFiniteError:
+        return core
 
 
 def _fit_on_gpu(
@@ -216,7 +239,7 @@ class _Fit:
         self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
         self.pixels, self.judge = photos.bank(), photos.judge()
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
-        self.adam = TableAdam(model)
+        self.adam = TableAdam(model, config.decay or 0.0)
         self.plain = not self.adam.parameters[COLOUR_IN][:, -DIRECTED:].any()
         self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
@@ -277,7 +300,7 @@ class _Fit:
         return taught > 0 and left_out < _BY_HEART * taught
 
     def _step(self, step: int, progress: float) -> None:
-        if self.photos.may_expose(progress):
+        if self.photos.may_expose(max(step / self.config.steps, progress / 2)):
             self.photos.exposing = self.judge.tells_exposures(self.model)
             self.model.train()
         n = self.rays_per_step

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from refield.field.coverage import knowable
-from refield.field.descent import MOST_SKIPPED, NonFiniteError
+from refield.field.descent import FADE_EVERY, MOST_SKIPPED, NonFiniteError, fading
 from refield.field.encoding import Contraction
 from refield.field.fit import (
     COARSEST,
@@ -135,6 +135,8 @@ class _GpuFit:
             graph.replay()
             step += 1
             self.rays_done += self.rays_per_step
+        if self.config.decay and step % FADE_EVERY == 0:
+            self.descent.tables.detach().mul_(fading(self.config.decay, self._rate(step)))
         self.occupancy.renew(step - 1)
         self.grid.copy_(self.model.sampler.grid)
         return step
@@ -153,7 +155,10 @@ class _GpuFit:
         return graph, step + graph.capture()
 
     def _set_rate(self, step: int) -> None:
-        self.descent.rate.fill_(self.config.rate * rate_factor(progress_of(self.config, step, self.began)))
+        self.descent.rate.fill_(self._rate(step))
+
+    def _rate(self, step: int) -> float:
+        return self.config.rate * rate_factor(progress_of(self.config, step, self.began))
 
     def _resized(self, samples: int) -> bool:
         """Choose the rays of a step and the lattice anew, after a step with so many samples; whether either changed."""

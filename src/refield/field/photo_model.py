@@ -24,8 +24,8 @@ from refield.scene.exposure import Exposure
 
 _EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.1, 0.25, 0.1  # of a fit: what is asked of it must be there first
 # So far into a fit that finds exposures, colours do not depend on where they are seen from: each photo has directions
-# of its own, by which a field would learn its exposure.
-_PLAIN = 0.5
+# of its own, by which a field would learn its exposure. Longer costs it gloss that it then has no time to learn.
+_PLAIN = 0.2
 _PLACES = 16  # where rays end, a side of the contracted cube
 _MOVING = 4  # every so-many-th ray tells how poses are wrong
 
@@ -70,16 +70,19 @@ class PhotoModel:
         self.poses = PoseFit(frames, float(distance)) if config.poses else None
         self.trust = PhotoTrust(bank, places) if config.trust else None
 
-    def may_expose(self, progress: float) -> bool:
+    def may_expose(self, done: float) -> bool:
         """Whether now, once in a fit, is to be found out if the photos' exposures differ at all: gains of photos that
-        were exposed alike would take up what the field does not show yet."""
-        now = self.exposures is not None and not self._asked_whether and progress >= _EXPOSED_FROM
+        were exposed alike would take up what the field does not show yet. ``done`` of the fit, in [0, 1]; the first
+        steps take the longest, so its time runs ahead of what the field has learnt."""
+        now = self.exposures is not None and not self._asked_whether and done >= _EXPOSED_FROM
         self._asked_whether |= now
         return now
 
     def plain(self, progress: float) -> bool:
         """Whether colours are not to depend on where they are seen from yet, lest the field learn the exposures."""
-        return self.exposures is not None and progress < (_PLAIN if self.exposing else _EXPOSED_FROM)
+        if self.exposures is None:
+            return False
+        return progress < _PLAIN if self.exposing else not self._asked_whether
 
     def ask(self, pixels: Tensor, progress: float) -> Asked:
         """Rays of pixels (N,) as they stand, with the photos' gains and trust; ``progress`` of the fit in [0, 1]."""

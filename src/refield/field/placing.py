@@ -1,7 +1,10 @@
-"""The field that a fit begins with: where it lies and how fine it is follow from the cameras alone."""
+"""The field that a fit begins with: where it lies and how fine it is follow from the cameras, and from what a first
+look shows around them.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,22 +12,27 @@ import torch
 from torch import Tensor
 
 from refield.field.encoding import Contraction
-from refield.field.radiance import HashField
+from refield.field.radiance import Field, HashField
+from refield.field.render import render_many
 from refield.field.sampling import RESOLUTION, OccupancySampler
-from refield.scene.capture import Capture, Frame
+from refield.scene.capture import Capture, Frame, Rays, camera_rays, centres
 
 if TYPE_CHECKING:
     from refield.field.fit import FitConfig
 
 COLOUR_IN, DIRECTED = 3, 15  # which parameter takes in directions, and in how many columns, but for a constant
+_CORE = 0.6  # of the cameras' distance from its centre
+_HELD, _LARGEST = 0.75, 4.0  # see `around`
+_PLACES = 20_000  # that a first field is asked for
 
 
-def new_field(capture: Capture, config: FitConfig, seed: int) -> HashField:
-    """Random weights, in the shape and the place that suit the photos."""
-    contraction = place_contraction(capture)
+def new_field(capture: Capture, config: FitConfig, seed: int, core: Contraction | None = None) -> HashField:
+    """Random weights, in the shape and the place that suit the photos; ``core``: see `around`."""
+    usual = place_contraction(capture)
+    contraction = usual if core is None else core
     shape = config.field
     if config.finest_auto:
-        shape = replace(shape, finest=finest_for(capture.train, contraction, shape.log2_table))
+        shape = replace(shape, finest=finest_for(capture.train, usual, shape.log2_table))
     # About two pixels, but half a cell of the occupancy grid at least: with more samples a ray fewer rays are seen in
     # the same time. On real photographs a third as long cost 2 dB.
     cells = max(2 / shape.finest, 0.5 / RESOLUTION)
@@ -49,19 +57,42 @@ def place_contraction(capture: Capture) -> Contraction:
     The centre is the least-squares meeting point of the optical axes, held to what the cameras have before them where
     the axes hardly meet (a forward-facing capture): the points of the reconstruction, or else their own spread.
     """
-    centres = torch.stack([f.centre for f in capture.frames])
+    eyes = centres(capture.frames)
     axes = torch.stack([f.world_from_cam[:3, 2] for f in capture.frames])
     eye = torch.eye(3, dtype=torch.float64)
     across = eye - axes[:, :, None] * axes[:, None, :]
-    spread = (centres - centres.mean(0)).norm(dim=-1).mean().clamp_min(1e-6)
-    ahead = _depth_of_points(capture, centres, axes)
-    guess = (centres + axes * (spread if ahead is None else ahead)).mean(0)
-    hold = 1e-3 * len(centres)
-    centre = torch.linalg.solve(across.sum(0) + hold * eye, (across @ centres[:, :, None]).sum(0)[:, 0] + hold * guess)
-    if ahead is not None and float(((centre - centres) * axes).sum(-1).median()) < 0.3 * ahead:
+    spread = (eyes - eyes.mean(0)).norm(dim=-1).mean().clamp_min(1e-6)
+    ahead = _depth_of_points(capture, eyes, axes)
+    guess = (eyes + axes * (spread if ahead is None else ahead)).mean(0)
+    hold = 1e-3 * len(eyes)
+    centre = torch.linalg.solve(across.sum(0) + hold * eye, (across @ eyes[:, :, None]).sum(0)[:, 0] + hold * guess)
+    if ahead is not None and float(((centre - eyes) * axes).sum(-1).median()) < 0.3 * ahead:
         centre = guess  # the axes cross by chance, among the cameras or behind them
-    distance = (centres - centre).norm(dim=-1).median()
-    return Contraction(centre.float(), float(distance) * 0.6)
+    distance = (eyes - centre).norm(dim=-1).median()
+    return Contraction(centre.float(), float(distance) * _CORE)
+
+
+def around(core: Contraction, first: Field, frames: Sequence[Frame]) -> Contraction:
+    """The core with three quarters in it of what the photos show, going by a first field; four times as large at most,
+    and never smaller.
+
+    Outside of the core cells grow with the square of the distance, and so do blur and haze: left-out photos of two real
+    scenes whose walls or houses lay there gained 1 and 2 dB. Much larger ones lose it again (see docs/results.md).
+    """
+    g = torch.Generator().manual_seed(0)
+    each = max(_PLACES // len(frames), 1)
+    sizes = torch.tensor([(f.camera.width, f.camera.height) for f in frames])
+    lines = [
+        camera_rays(f.camera, f.world_from_cam, torch.rand(each, 2, generator=g) * size)
+        for f, size in zip(frames, sizes)
+    ]
+    rays = Rays(torch.cat([r.origins for r in lines]), torch.cat([r.directions for r in lines]))
+    shown = render_many(first, rays)
+    solid = (shown.opacity > 0.5) & shown.depth.isfinite()
+    if not solid.any():
+        return core
+    reach = core.reach(rays.origins[solid] + rays.directions[solid] * shown.depth[solid, None])
+    return replace(core, radius=core.radius * min(max(float(reach.quantile(_HELD)), 1.0), _LARGEST))
 
 
 def _depth_of_points(capture: Capture, centres: Tensor, axes: Tensor, most: int = 5000) -> Tensor | None:

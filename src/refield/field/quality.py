@@ -38,6 +38,8 @@ _EFFORTS: dict[Quality, _Effort] = {
 }
 _PIXELS_PER_ENTRY = 60
 """of a level's table: fewer pixels leave it empty, more meet in it by chance"""
+_DECAY = 0.1
+"""of large tables"""
 _GROWTH = 1.5  # from level to level
 
 
@@ -65,6 +67,8 @@ def sized(config: FitConfig, frames: Sequence[Frame], quality: Quality) -> FitCo
         patience=max(config.patience, steps // (2 * config.check_every)),
         max_seconds=config.max_seconds or effort.seconds,
         samples=samples,
+        decay=(_DECAY if large else 0.0) if config.decay is None else config.decay,
+        look_around=large if config.look_around is None else config.look_around,
         sharpen=large if config.sharpen is None else config.sharpen,
         field=_with(config.field, shape),
         photos=_with(config.photos, PhotoModelConfig(exposures=large)),
