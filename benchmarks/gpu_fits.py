@@ -171,7 +171,7 @@ def nerfacto(report: Report, capture: Capture, config: NerfactoFitConfig, device
         model = NerfactoField(config.field, sampler, config.seed)
         fitting: Any = fit_nerfacto._NerfactoFit(model, capture, config, looks.append)
         move(model, device)  # type: ignore[arg-type]
-        fitting.pixels = graphed.DevicePixels(fitting.pixels, device)
+        fitting.photos.bank = graphed.DevicePixels(fitting.photos.bank, device)
         if fitting.judge.rays is not None:
             rays = fitting.judge.rays
             fitting.judge.rays = Rays(rays.origins.to(device), rays.directions.to(device))

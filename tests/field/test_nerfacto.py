@@ -369,7 +369,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 @pytest.mark.parametrize("background", ["random", "last_sample"])
 def test_held_out_views_are_explained(capture: Capture, background: str) -> None:
     looks: list[FitProgress] = []
-    field = fit_nerfacto(capture, replace(TINY, background=background), looks.append)
+    field = fit_nerfacto(capture, replace(TINY, background=background), looks.append).field
     assert looks[-1].psnr > 25 and [p.step for p in looks] == [100, 200]
     assert looks[-1].rays_per_second > 0 and looks[-1].samples_per_ray == SMALL.samples
     view = render_frame(field, capture.held_out[0])
@@ -381,7 +381,7 @@ def test_held_out_views_are_explained(capture: Capture, background: str) -> None
 
 def test_same_seed_same_field(capture: Capture) -> None:
     short = replace(TINY, steps=8)
-    a, b, c = (fit_nerfacto(capture, replace(short, seed=s)) for s in (0, 0, 1))
+    a, b, c = (fit_nerfacto(capture, replace(short, seed=s)).field for s in (0, 0, 1))
     assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters()))
     assert not all(torch.equal(x, y) for x, y in zip(a.parameters(), c.parameters()))
 
@@ -393,7 +393,7 @@ def test_training_stops_in_time(capture: Capture) -> None:
 
 
 def test_a_loss_that_stays_infinite_ends_training(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "colour_loss", lambda rgb, truth: rgb.mean() * torch.nan)
+    monkeypatch.setattr(fitting, "colour_loss", lambda errors, trust: errors.mean() * torch.nan)
     with pytest.raises(NonFiniteError, match="20 steps in a row"):
         fit_nerfacto(capture, TINY)
 
@@ -401,12 +401,12 @@ def test_a_loss_that_stays_infinite_ends_training(capture: Capture, monkeypatch:
 def test_a_single_bad_loss_is_stepped_over(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     honest, calls = fitting.colour_loss, []
 
-    def often_bad(rgb: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    def often_bad(errors: torch.Tensor, trust: torch.Tensor | None) -> torch.Tensor:
         calls.append(1)
-        return honest(rgb, truth) * (torch.nan if len(calls) % 15 else 1.0)
+        return honest(errors, trust) * (torch.nan if len(calls) % 15 else 1.0)
 
     monkeypatch.setattr(fitting, "colour_loss", often_bad)
-    field = fit_nerfacto(capture, replace(TINY, steps=45))
+    field = fit_nerfacto(capture, replace(TINY, steps=45)).field
     assert len(calls) == 45 and all(torch.isfinite(p).all() for p in field.parameters())
 
 

@@ -16,7 +16,7 @@ from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig, fit_nerfacto
 from refield.field.memory import Memory, memory_fault, memory_of
 from refield.field.nerfacto import NerfactoField
 from refield.field.photo_size import sizes_told
-from refield.field.quality import OPEN, Quality, sized
+from refield.field.quality import OPEN, Quality, asked_of, sized
 from refield.field.radiance import HashField
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
 from refield.photos.landmarks import Landmarks, read_landmarks, write_landmarks
@@ -50,7 +50,8 @@ class Train:
     """photos without poses: how they are taken in, and how their poses are found"""
     architecture: Literal["hash", "nerfacto", "nerfacto-reduced"] = "hash"
     """of the field: hash, which fits on a CPU in less than a minute; NeRFacto's, for long fits; or that one reduced to
-    what a CPU can train in minutes, which heeds no ``nerfacto`` option but the time limit and the seed"""
+    what a CPU can train in minutes, which heeds no ``nerfacto`` option but the time limit, the seed, and those of the
+    photos"""
     fit: FitConfig = OPEN
     nerfacto: NerfactoFitConfig = field(default_factory=NerfactoFitConfig)
 
@@ -73,7 +74,7 @@ def _config_of(options: Train) -> FitConfig | NerfactoFitConfig:
     if options.architecture == "hash":
         return options.fit
     long = options.nerfacto
-    reduced = replace(REDUCED, max_seconds=long.max_seconds, seed=long.seed)
+    reduced = replace(REDUCED, max_seconds=long.max_seconds, seed=long.seed, photos=long.photos, size=long.size)
     return long if options.architecture == "nerfacto" else reduced
 
 
@@ -108,6 +109,8 @@ def train(
     capture, landmarks = _loaded(task, clock)
     if quality is not None and isinstance(config, FitConfig):
         config = sized(config, capture.train, quality)
+    elif isinstance(config, NerfactoFitConfig):
+        config = replace(config, photos=asked_of(capture.train, config.photos))
     needed = memory_of(capture, config)
     _check_memory(task.data, needed)
     _check_cameras(task.data, capture)
@@ -172,9 +175,8 @@ def train_more(work: Path, clock: Clock, config: FitConfig, quality: Quality) ->
 
 def _tell(capture: Capture, config: FitConfig | NerfactoFitConfig, needed: Memory, clock: Clock) -> None:
     """What is known before it begins: sizes, memory, time."""
-    told = [f"memory: {needed}"]
+    told = [sizes_told(capture, config.size) or "", f"memory: {needed}"]
     if isinstance(config, FitConfig):
-        told.insert(0, sizes_told(capture, config.size) or "")
         most = "" if config.max_seconds is None else f", {config.max_seconds:.0f} s at most"
         told.append(f"work: {config.steps} steps of {config.samples} samples{most}")
     for line in told:
@@ -189,7 +191,8 @@ def _fitted(
     if isinstance(config, FitConfig):
         done = fit_capture(capture, config, on_progress)
         return done.field, done.capture
-    return fit_nerfacto(capture, config, on_progress), capture
+    fit = fit_nerfacto(capture, config, on_progress)
+    return fit.field, fit.capture
 
 
 def _loaded(task: Sources, clock: Clock) -> tuple[Capture, Landmarks | None]:

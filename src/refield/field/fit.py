@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
 import torch
 
@@ -107,11 +107,14 @@ _LATE = 0.3  # of its time; so late a fit does not begin anew
 _BY_HEART = 0.1
 
 
+_Field = TypeVar("_Field")
+
+
 @dataclass(frozen=True)
-class Fitted:
+class Fitted(Generic[_Field]):
     """A field, and what became known of the photos that it was fitted to."""
 
-    field: HashField
+    field: _Field
     capture: Capture
     """with the photos' exposures, poses and lenses as the fit found them, where it was to find them"""
 
@@ -144,7 +147,7 @@ def fit_capture(
     start: HashField | None = None,
     goes_on: bool = False,
     on_step: StepCallback | None = None,
-) -> Fitted:
+) -> Fitted[HashField]:
     """Fit a field to the capture's training frames.
 
     Args:

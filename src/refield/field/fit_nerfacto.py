@@ -12,13 +12,15 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.descent import MOST_SKIPPED, NonFiniteError
-from refield.field.fit import FitProgress, ProgressCallback
+from refield.field.fit import FitProgress, Fitted, ProgressCallback, rate_factor
 from refield.field.interlevel import interlevel_loss
+from refield.field.kernels.reference import Batch, Stepped, compared
 from refield.field.losses import colour_loss, scale_gradients
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
-from refield.field.photos import HeldOut
-from refield.field.pixels import PixelBank
-from refield.field.placing import place_contraction
+from refield.field.photo_model import PhotoModel, PhotoModelConfig
+from refield.field.photo_size import PhotoSizeConfig, as_read, at_full_size
+from refield.field.photos import UNCHANGED, Photos
+from refield.field.placing import DIRECTED, place_contraction
 from refield.field.proposal import Histogram, annealing
 from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples, accumulate_rgb, weights
@@ -58,6 +60,10 @@ class NerfactoFitConfig:
     background: Literal["random", "last_sample"] = "random"
     """what is seen through what stays transparent: noise, or as in nerfstudio the last sample's colour. That leaves the
     last sample's density open, and renderings here are on black"""
+    photos: PhotoModelConfig = field(default_factory=PhotoModelConfig)
+    """what is found out about the photos, beside the field"""
+    size: PhotoSizeConfig = field(default_factory=PhotoSizeConfig)
+    """at which the photos are read"""
     field: NerfactoConfig = field(default_factory=NerfactoConfig)
     """shape of the field"""
     check_every: int = 250
@@ -85,25 +91,27 @@ REDUCED = NerfactoFitConfig(
 
 def fit_nerfacto(
     capture: Capture, config: NerfactoFitConfig = NerfactoFitConfig(), on_progress: ProgressCallback | None = None
-) -> NerfactoField:
+) -> Fitted[NerfactoField]:
     """Fit a NeRFacto field to the capture's training frames.
 
     Raises:
         ValueError: no frame to train on.
-        NonFiniteError: the loss was not finite for 20 steps in a row.
+        NonFiniteError: the loss or its gradient was not finite for 20 steps in a row.
     """
+    capture, _ = as_read(capture, UNCHANGED, config.size)
     if not capture.train:
         raise ValueError("the capture has no frame to train on")
     torch.manual_seed(config.seed)
     model = NerfactoField(config.field, looking_everywhere(place_contraction(capture), config.field), config.seed)
-    _NerfactoFit(model, capture, config, on_progress).run()
+    fit = _NerfactoFit(model, capture, config, on_progress)
+    fit.run()
     model.eval().requires_grad_(False)
     # proposals know nothing of what an update moves: its field is marched through, where this one may hold something
     sampler = OccupancySampler.from_density(
         model.density, model.contraction, model.sampler.step, model.sampler.resolution
     )
     model.looking_where(sampler.grid)
-    return model
+    return Fitted(model, at_full_size(fit.photos.told(capture, fit.judge, cast(Any, model))))
 
 
 class _NerfactoFit:
@@ -113,8 +121,12 @@ class _NerfactoFit:
         self, model: NerfactoField, capture: Capture, config: NerfactoFitConfig, on_progress: ProgressCallback | None
     ) -> None:
         self.model, self.config, self.on_progress = model, config, on_progress
-        self.pixels = PixelBank(capture.train)
-        self.judge = HeldOut(capture.held_out)
+        photos = Photos.of(capture)
+        self.judge = photos.judge()
+        self.photos = PhotoModel(photos.bank(), model.sampler, config.photos)
+        if config.photos.exposures:  # see `PhotoModel.plain`
+            with torch.no_grad():
+                model.colour_in[:, -DIRECTED:] = 0
         self.adam = torch.optim.Adam(model.parameters(), lr=config.rate, eps=1e-15, fused=True)
         self.began = time.perf_counter()
         self.done, self.looked = 0, -1
@@ -137,51 +149,92 @@ class _NerfactoFit:
         return max(self.done / self.config.steps, by_time)
 
     def _step(self, step: int) -> None:
-        chosen = torch.randint(len(self.pixels), (self.config.rays,))
+        progress = self._progress()
+        if self.photos.may_expose(progress):
+            self.photos.exposing = self.judge.tells_exposures(cast(Any, self.model))
+            self.model.train()
+        asked = self.photos.ask(torch.randint(len(self.photos.bank), (self.config.rays,)), progress)
         learning = step - self.proposed >= proposal_interval(step, self.config)
-        loss = self._loss(self.pixels.rays(chosen), self.pixels.colours(chosen), step, learning)
-        if not math.isfinite(loss.item()):
+        ways = Rays(*(r.detach().requires_grad_(asked.batch.moving > 0) for r in asked.batch.rays[:2]))
+        loss, done = self._loss(asked.batch, ways, step, learning)
+        if not self._descend(loss, step, self.photos.plain(progress)):
             self.bad += 1
             if self.bad >= MOST_SKIPPED:
-                raise NonFiniteError(f"the loss was not finite for {MOST_SKIPPED} steps in a row")
+                raise NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
             return
         self.bad = 0
         if learning:
             self.proposed = step
-        self._descend(loss, step)
+        if moving := asked.batch.moving:
+            assert ways.origins.grad is not None and ways.directions.grad is not None
+            done = done._replace(to_rays=(ways.origins.grad[:moving], ways.directions.grad[:moving]))
+        self.photos.learn(asked, done, progress, rate_factor(progress))
 
-    def _descend(self, loss: Tensor, step: int) -> None:
+    def _descend(self, loss: Tensor, step: int, plain: bool) -> bool:
+        """Take a step if the loss and its gradient are finite; whether it was taken."""
+        if not math.isfinite(loss.item()):
+            return False
         self.adam.zero_grad(set_to_none=True)  # Adam passes over networks that took no part
         loss.backward()
+        # a gradient that is not finite shows in the networks', through which all of it has gone
+        networks = [p.grad for p in self.model.parameters() if p.grad is not None and p.dim() == 2]
+        if not all(bool(g.isfinite().all()) for g in networks):
+            return False
+        if plain and self.model.colour_in.grad is not None:
+            self.model.colour_in.grad[:, -DIRECTED:] = 0
         for group in self.adam.param_groups:
             group["lr"] = rate_at(step, self.config)
         self.adam.step()
+        return True
 
-    def _loss(self, rays: Rays, truth: Tensor, step: int, learning: bool) -> Tensor:
-        """Of one batch. If the proposals are not ``learning``, nothing of theirs is kept for a backward pass."""
-        config, model = self.config, self.model
+    def _loss(self, batch: Batch, ways: Rays, step: int, learning: bool) -> tuple[Tensor, Stepped]:
+        """Of one batch. If the proposals are not ``learning``, nothing of theirs is kept for a backward pass.
+
+        ``ways`` are the batch's rays, by which the field's part of the loss is differentiable.
+        """
+        config, rays = self.config, Rays(*batch.rays[:2])
         with torch.set_grad_enabled(learning):
-            told, edges = model.propose(rays, True, annealing(step, config.anneal_slope, config.anneal_steps))
+            told, edges = self.model.propose(rays, True, annealing(step, config.anneal_slope, config.anneal_steps))
+        loss, done = self._compare(batch, ways, edges)
+        if learning:
+            w = done.weights.reshape(len(rays), -1)
+            loss = loss + config.interlevel * interlevel_loss(Histogram(edges, w), told)
+        return loss, done
+
+    def _compare(self, batch: Batch, ways: Rays, edges: Tensor) -> tuple[Tensor, Stepped]:
+        """The field asked between the edges (N, K + 1) of each ray: its part of the loss, and what there is to tell.
+
+        Colours heed the batch's directions, not those of ``ways``: see `Stepped.to_rays`.
+        """
+        config, model = self.config, self.model
         samples = model.span.samples(edges)
-        sigmas, rgbs = model(*samples.positions(rays))
+        x, _ = samples.positions(ways)
+        sigmas, rgbs = model(x, batch.rays[1][samples.ray_ids])
+        told = sigmas.detach()
         if config.gradient_unit > 0:
             sigmas, rgbs = scale_gradients(sigmas, rgbs, samples, config.gradient_unit * model.contraction.radius)
         w = weights(sigmas, samples)
-        loss = colour_loss(self._seen(w, rgbs, samples), truth)
-        loss = loss + config.distortion * _distortion(w, edges, samples)
-        if learning:
-            loss = loss + config.interlevel * interlevel_loss(Histogram(edges, w.reshape(len(rays), -1)), told)
-        return loss
+        shown = self._shown(w, rgbs, samples)
+        errors = compared(shown, batch)
+        loss = colour_loss(errors, batch.trust) + config.distortion * _distortion(w, edges, samples)
+        with torch.no_grad():
+            cells = model.sampler.cells(x.detach())
+            each = w.reshape(len(edges), -1)
+            heaviest = each.argmax(-1) + torch.arange(len(each)) * each.shape[1]
+        done = Stepped(float(loss.detach()), cells, w.detach(), told, len(edges))
+        return loss, done._replace(shown=shown[:, :3].detach(), errors=errors.detach(), heaviest=heaviest)
 
-    def _seen(self, w: Tensor, rgbs: Tensor, samples: Samples) -> Tensor:
-        """The colour of each ray before the background, (N, 3)."""
+    def _shown(self, w: Tensor, rgbs: Tensor, samples: Samples) -> Tensor:
+        """What is composited along each ray, with its opacity, (N, 4)."""
         rgb, opacity = accumulate_rgb(w, rgbs, samples)
-        last = self.config.background == "last_sample"
-        behind = rgbs[samples.ray_offsets[1:] - 1] if last else torch.rand_like(rgb)
-        return rgb + (1 - opacity)[:, None] * behind
+        if self.config.background == "last_sample":
+            rgb = rgb + (1 - opacity)[:, None] * rgbs[samples.ray_offsets[1:] - 1]
+            opacity = torch.ones_like(opacity)
+        return torch.cat([rgb, opacity[:, None]], -1)
 
     def _look(self) -> None:
-        psnr = self.judge.psnr(cast(Any, self.model))
+        self.photos.inform(self.judge)
+        psnr = self.judge.psnr(cast(Any, self.model), self.photos.exposing)
         self.model.train()
         self.looked = self.done
         if self.on_progress:

@@ -38,9 +38,13 @@ class DevicePixels:
     def __len__(self) -> int:
         return self._count
 
+    def frame_of(self, pixels: Tensor) -> Tensor:
+        """Index of the frame that owns each pixel, (B,) -> (B,)."""
+        return torch.searchsorted(self._starts, pixels, right=True) - 1
+
     def rays(self, pixels: Tensor) -> Rays:
         """World rays through pixel centres, (B,) -> Rays of B."""
-        owner = torch.searchsorted(self._starts, pixels, right=True) - 1
+        owner = self.frame_of(pixels)
         local = pixels - self._starts[owner] if self._places is None else self._places[pixels]
         d = self._directions[self._begins[owner] + local]
         return Rays(self._centres[owner], (self._rotations[owner] * d[:, None, :]).sum(-1))

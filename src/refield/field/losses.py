@@ -8,9 +8,9 @@ from refield.field.kernels.reference import scale_gradient
 from refield.field.volrend import Samples
 
 
-def colour_loss(rgb: Tensor, truth: Tensor) -> Tensor:
-    """Eq. 2 as a mean: (N, 3), (N, 3) -> ()."""
-    return (rgb - truth).square().mean()
+def colour_loss(errors: Tensor, trust: Tensor | None = None) -> Tensor:
+    """Eq. 2 as a mean: what is seen less what the photos show (N, 3), and how much each ray counts (N,) -> ()."""
+    return (errors.square() if trust is None else trust[:, None] * errors.square()).mean()
 
 
 def scale_gradients(sigmas: Tensor, rgbs: Tensor, samples: Samples, unit: float) -> tuple[Tensor, Tensor]:

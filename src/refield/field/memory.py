@@ -41,8 +41,7 @@ class Memory:
 
 def memory_of(capture: Capture, config: FitConfig | NerfactoFitConfig) -> Memory:
     """What the fit of either architecture will take for this capture."""
-    if isinstance(config, FitConfig):
-        capture = as_read(capture, UNCHANGED, config.size)[0]
+    capture = as_read(capture, UNCHANGED, config.size)[0]
     pixels = sum(f.camera.width * f.camera.height for f in capture.train)
     most = most_pixels(config) if isinstance(config, FitConfig) else None
     photos = 3 * pixels if most is None or pixels <= most else 7 * most  # with its place in the photo

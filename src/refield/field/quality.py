@@ -75,6 +75,14 @@ def sized(config: FitConfig, frames: Sequence[Frame], quality: Quality) -> FitCo
     )
 
 
+def asked_of(frames: Sequence[Frame], photos: PhotoModelConfig) -> PhotoModelConfig:
+    """What a fit of the other architecture, whose size is its own, finds out about the training frames: where
+    ``photos`` leaves that open, exposures of as many pixels as make a quality's field larger than the smallest."""
+    pixels = sum(f.camera.width * f.camera.height for f in frames)
+    large = _log2_table(pixels, _EFFORTS["draft"]) > FitConfig().field.log2_table
+    return _with(photos, PhotoModelConfig(exposures=large))
+
+
 def _log2_table(pixels: int, effort: _Effort) -> int:
     least = FitConfig().field.log2_table
     return int(min(max(round(math.log2(max(pixels, 1) / _PIXELS_PER_ENTRY)), least), effort.largest_table))
