@@ -172,6 +172,8 @@ def test_the_other_architecture_all_the_way(place, monkeypatch, capsys):
     few += ["--nerfacto.steps", "5", "--nerfacto.rays", "64"]
     assert main(["train", "data", "other", "--architecture", "nerfacto", *few]) == 0
     assert json.loads((place / "other/field/field.json").read_text())["architecture"] == "NerfactoField"
+    assert main(["train", "data", "posed", "--architecture", "nerfacto", *few, "--nerfacto.photos.poses"]) == 0
+    assert (place / "posed/capture/refined.json").is_file() and not (place / "other/capture/refined.json").exists()
     believing(monkeypatch, "moved")
     assert main(["update", "other", "new", *FEW]) == 0
     assert main(["render", "other", "--cameras", "new/transforms.json", "--out", "pictures"]) == 0

@@ -394,8 +394,29 @@ def test_training_stops_in_time(capture: Capture) -> None:
 
 def test_a_loss_that_stays_infinite_ends_training(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fitting, "colour_loss", lambda errors, trust: errors.mean() * torch.nan)
-    with pytest.raises(NonFiniteError, match="20 steps in a row"):
+    with pytest.raises(NonFiniteError, match="20 steps in a row") as caught:
         fit_nerfacto(capture, TINY)
+    assert caught.value.steps == 0
+
+
+def test_the_last_good_state_is_kept(capture: Capture) -> None:
+    """From its third step on, one network's gradient is infinite."""
+    steps: list[int] = []
+
+    class Broken(fitting._NerfactoFit):
+        def _descend(self, loss: Tensor, step: int, plain: bool) -> bool:
+            steps.append(step)
+            if len(steps) == 3:
+                self.model.colour_mid.register_hook(lambda grad: grad * torch.inf)
+            return super()._descend(loss, step, plain)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(NonFiniteError) as caught:
+        patch.setattr(fitting, "_NerfactoFit", Broken)
+        fit_nerfacto(capture, TINY)
+    assert caught.value.steps == 2 and len(steps) == 22
+    field = caught.value.field
+    assert isinstance(field, NerfactoField) and all(torch.isfinite(p).all() for p in field.parameters())
+    assert torch.isfinite(render_rays(field, some_rays()).rgb).all()
 
 
 def test_a_single_bad_loss_is_stepped_over(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:

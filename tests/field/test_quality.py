@@ -12,7 +12,7 @@ import torch
 from refield.field.compiling import compiling
 from refield.field.fit import FitConfig
 from refield.field.photo_model import PhotoModelConfig
-from refield.field.quality import OPEN, sized
+from refield.field.quality import OPEN, asked_of, sized
 from refield.field.radiance import HashFieldConfig
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame
@@ -55,6 +55,14 @@ def test_what_is_said_goes_before_the_quality() -> None:
     assert (found.steps, found.max_seconds, found.sharpen) == (2000, 7.0, False)
     assert found.field.log2_table == 17 and found.field.levels >= HashFieldConfig().levels
     assert found.photos == PhotoModelConfig(exposures=False, poses=False)
+
+
+def test_the_other_architecture_asks_for_exposures_of_large_captures_too() -> None:
+    few, many, unsaid = frames(40, 96, 96), frames(60, 540, 960), PhotoModelConfig()
+    assert not asked_of(few, unsaid).exposures and asked_of(many, unsaid).exposures
+    assert asked_of(few, PhotoModelConfig(exposures=True)).exposures
+    found = asked_of(many, PhotoModelConfig(exposures=False, poses=True))
+    assert found == PhotoModelConfig(exposures=False, poses=True)
 
 
 def test_compiling_is_noticed() -> None:

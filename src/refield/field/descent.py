@@ -8,6 +8,7 @@ import torch
 
 from refield.field import kernels
 from refield.field.encoding import large_zeros
+from refield.field.nerfacto import NerfactoField
 from refield.field.radiance import HashField
 
 MOST_SKIPPED = 20  # steps in a row
@@ -16,8 +17,8 @@ MOST_SKIPPED = 20  # steps in a row
 class NonFiniteError(RuntimeError):
     """The loss or its gradient stayed infinite or NaN for too long."""
 
-    field: HashField | None = None
-    """the last good state, ready for use, where `fit.fit_field` raises this"""
+    field: HashField | NerfactoField | None = None
+    """the last good state, ready for use, where the fit of a whole field raises this"""
     steps: int = 0
     """that were taken before"""
 

@@ -96,7 +96,7 @@ def fit_nerfacto(
 
     Raises:
         ValueError: no frame to train on.
-        NonFiniteError: the loss or its gradient was not finite for 20 steps in a row.
+        NonFiniteError: the loss or its gradient was not finite for 20 steps in a row; it holds the last good state.
     """
     capture, _ = as_read(capture, UNCHANGED, config.size)
     if not capture.train:
@@ -104,14 +104,23 @@ def fit_nerfacto(
     torch.manual_seed(config.seed)
     model = NerfactoField(config.field, looking_everywhere(place_contraction(capture), config.field), config.seed)
     fit = _NerfactoFit(model, capture, config, on_progress)
-    fit.run()
+    try:
+        fit.run()
+    except NonFiniteError as error:
+        error.field, error.steps = _ready(model), fit.taken
+        raise
+    return Fitted(_ready(model), at_full_size(fit.photos.told(capture, fit.judge, cast(Any, model))))
+
+
+def _ready(model: NerfactoField) -> NerfactoField:
+    """The field for use, its occupancy found."""
     model.eval().requires_grad_(False)
     # proposals know nothing of what an update moves: its field is marched through, where this one may hold something
     sampler = OccupancySampler.from_density(
         model.density, model.contraction, model.sampler.step, model.sampler.resolution
     )
     model.looking_where(sampler.grid)
-    return Fitted(model, at_full_size(fit.photos.told(capture, fit.judge, cast(Any, model))))
+    return model
 
 
 class _NerfactoFit:
@@ -130,7 +139,8 @@ class _NerfactoFit:
         self.adam = torch.optim.Adam(model.parameters(), lr=config.rate, eps=1e-15, fused=True)
         self.began = time.perf_counter()
         self.done, self.looked = 0, -1
-        self.bad = 0
+        self.taken, self.bad = 0, 0
+        """steps, and those in a row that were left out since"""
         self.proposed = -config.proposal_every
         """the last step at which the proposals learnt"""
 
@@ -162,7 +172,7 @@ class _NerfactoFit:
             if self.bad >= MOST_SKIPPED:
                 raise NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
             return
-        self.bad = 0
+        self.taken, self.bad = self.taken + 1, 0
         if learning:
             self.proposed = step
         if moving := asked.batch.moving:
