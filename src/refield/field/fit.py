@@ -20,7 +20,7 @@ from refield.field.occupancy import OccupancyTrainer
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
 from refield.field.photo_size import PhotoSizeConfig, as_read, at_full_size
 from refield.field.photos import UNCHANGED, Photos, Since
-from refield.field.placing import COLOUR_IN, DIRECTED, around, new_field, opened, place_contraction
+from refield.field.placing import COLOUR_IN, DIRECTED, around, new_field, opened, place_contraction, stand_outside
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.sampling import STOP
 from refield.scene.capture import Capture
@@ -244,7 +244,8 @@ class _Fit:
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model, config.decay or 0.0)
         self.plain = not self.adam.parameters[COLOUR_IN][:, -DIRECTED:].any()
-        self.occupancy = OccupancyTrainer(model, allowed=knowable(model.sampler, photos.train))
+        allowed, outside = knowable(model.sampler, photos.train), stand_outside(model.contraction, photos.train)
+        self.occupancy = OccupancyTrainer(model, allowed=allowed, outside=outside)
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
         self.samples_per_ray = config.samples / 512

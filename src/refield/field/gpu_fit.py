@@ -24,6 +24,7 @@ from refield.field.graphed import Descent, DevicePixels, GraphedStep
 from refield.field.kernels.reference import Aim
 from refield.field.occupancy import DECAY, EVERY, OccupancyTrainer
 from refield.field.photos import Photos
+from refield.field.placing import stand_outside
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP
 from refield.scene.capture import Rays
@@ -83,11 +84,12 @@ class _GpuFit:
         with torch.device("cpu"):  # photos are read and posed there
             self.pixels = DevicePixels(photos.bank(), device)
             self.judge = photos.judge()
+            outside = stand_outside(model.contraction, photos.train)
         if self.judge.rays is not None:
             r = self.judge.rays
             self.judge.rays = Rays(r.origins.to(device), r.directions.to(device))
             self.judge.truth = self.judge.truth.to(device)
-        self.occupancy = OccupancyTrainer(model, allowed=allowed)
+        self.occupancy = OccupancyTrainer(model, allowed=allowed, outside=outside)
         model.looking_where(allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.grid = model.sampler.grid.clone()  # the one that graphs read
         self.descent = Descent(model)

@@ -36,10 +36,15 @@ class OccupancyTrainer:
     """
 
     def __init__(
-        self, model: HashField, cull_from: int = 128, allowed: Tensor | None = None, doubt: float = 2 * _OPACITY
+        self,
+        model: HashField,
+        cull_from: int = 128,
+        allowed: Tensor | None = None,
+        doubt: float = 2 * _OPACITY,
+        outside: bool = True,
     ) -> None:
         """``allowed`` (R**3,) bool: cells that may hold something at all; all by default. ``doubt``: the opacity that
-        cells begin with, except where cameras stand."""
+        cells begin with, except where cameras stand. ``outside``: whether they stand around the core."""
         self.model, self.cull_from = model, cull_from
         device = model.sampler.grid.device
         cells = model.sampler.resolution**3
@@ -56,7 +61,7 @@ class OccupancyTrainer:
         for some in torch.arange(cells, device=device).split(1 << 20):
             self.state[some, 2] = model.sampler.step_at(some)
             distance = model.sampler.distance(some)
-            self.among_cameras[some] = (distance > 1) & (distance < _CAMERAS)
+            self.among_cameras[some] = (distance > 1) & (distance < _CAMERAS) & outside
             self.state[some, 0] = torch.where(self.among_cameras[some], 0.0, doubt)
             self.state[some, 3] = torch.where(distance > _BACKGROUND, 0.0, -1.0)
 

@@ -72,6 +72,12 @@ def place_contraction(capture: Capture) -> Contraction:
     return Contraction(centre.float(), float(distance) * _CORE)
 
 
+def stand_outside(core: Contraction, frames: Sequence[Frame]) -> bool:
+    """Whether most cameras stand outside of the core's sphere, and look into it: of one that `around` made larger, they
+    are a part."""
+    return float((centres(frames).float() - core.centre.cpu()).norm(dim=-1).median()) > core.radius
+
+
 def around(core: Contraction, first: Field, frames: Sequence[Frame]) -> Contraction:
     """The core with three quarters in it of what the photos show, going by a first field; four times as large at most,
     and never smaller.
