@@ -50,6 +50,16 @@ class OccupancySampler:
         with torch.no_grad():
             return Samples(*kernels.march_visible(*self._question(rays, jitter), net, stop, self.fine))
 
+    def onward(self, rays: Rays, t: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The next samples of N rays that have come to t (N,), ``most`` of each: see `kernels.next_samples`."""
+        with torch.no_grad():
+            lines, *where = self._question(rays, False)
+            return kernels.next_samples(lines, *where, t, most, self.fine)
+
+    def first(self, rays: Rays) -> Tensor:
+        """Where the first sample of each of N rays begins, (N,); infinite where there is none."""
+        return self.onward(rays, torch.full_like(rays.origins[:, 0], self.near), 1)[0][:, 0]
+
     def _question(self, rays: Rays, jitter: bool) -> tuple[Rays3, Space, Tensor, Lattice]:
         n = len(rays)
         shift = torch.rand(n, device=rays.origins.device) if jitter else rays.origins.new_zeros(n)

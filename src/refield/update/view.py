@@ -1,0 +1,129 @@
+"""Pictures of an updated field, without gradients: what shows the first visit's field is left to its compiled loop.
+
+A ray is the old field's, in the new light, until it comes to a cell that changed; most are opaque before. From there on
+what changed is asked for a few samples at a time, until it is opaque, and then what never changed in front of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from refield.field import kernels
+from refield.field.kernels.onward import NO_LIGHTS, Lights, Shown, Way, summed
+from refield.field.radiance import HashField
+from refield.field.sampling import STOP, OccupancySampler
+from refield.field.volrend import Rendering
+from refield.field.warp import leaving
+from refield.scene.capture import Rays
+from refield.update.light import Relighting
+
+_FIRST, _MOST = 4, 32  # samples of what changed that a ray is asked for at once, at first and later
+
+
+@dataclass(frozen=True)
+class View:
+    """What an updated field is to those who look at it."""
+
+    base: HashField
+    """shows what never changed"""
+    gone: Tensor
+    """(R, R, R) uint8: cells of which the base does not know, or knows no longer, what is in them"""
+    known: OccupancySampler
+    """looks into all others"""
+    told: OccupancySampler
+    """looks into those that changed"""
+    boxes: tuple[Tensor, ...]
+    """(2, 3) world, which hold all cells that changed"""
+    lights: Lights
+    """on what never changed"""
+    field: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    """knows what is in cells that changed, as a `refield.field.radiance.Field`"""
+
+    def rendered(self, rays: Rays, chunk: int) -> Rendering:
+        """What N rays see; ``chunk`` of them are worked on at once."""
+        with torch.no_grad():
+            begun = [self._begun(rays[i : i + chunk]) for i in range(0, max(len(rays), 1), chunk)]
+            sums, t, depth, first = (torch.cat(parts) for parts in zip(*begun))
+            under_way = (t < self.known.lattice[1]) & (depth < STOP)
+            for rows in under_way.nonzero()[:, 0].split(chunk):
+                sums[rows] = self._ended(rays[rows], sums[rows], t[rows], depth[rows], first[rows])
+        return Rendering(*summed(sums))
+
+    def _begun(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As far as the base alone shows anything: sums (N, 7), where rays have come to and their optical depth (N,)
+        each; and where the first sample of what changed begins, (N,), infinite where there is none."""
+        exits = torch.stack([leaving(rays, box) for box in self.boxes]).amax(0)
+        near = (exits > 0).nonzero()[:, 0]
+        first = torch.full_like(exits, torch.inf)
+        if len(near):
+            first[near] = self._within(exits).first(rays[near])
+        way = Way(torch.full_like(first, self.known.near), first, torch.zeros_like(first), self.gone)
+        sums = kernels.render_until(*self._asked(rays, self.base.sampler), way, self.lights)
+        return sums, way.t, way.depth, first
+
+    def _ended(self, rays: Rays, sums: Tensor, t: Tensor, depth: Tensor, first: Tensor) -> Tensor:
+        """The sums (N, 7) of rays that have come to something else, when they are opaque or see nothing more."""
+        told, until = self._told_on(rays, first, depth)
+        nowhere = self.gone.new_zeros(0, 0, 0)
+        known = kernels.shown_on(
+            *self._asked(rays, self.known), Way(t.clone(), until, depth.clone(), nowhere), self.lights
+        )
+        return kernels.blend(sums, known, told)
+
+    def _told_on(self, rays: Rays, first: Tensor, depth: Tensor) -> tuple[Shown, Tensor]:
+        """What changed along rays with an optical depth (N,) behind them, from its first sample on until it alone is
+        opaque; and from where on nothing else is seen, (N,)."""
+        t, depth, until = first.clone(), depth.clone(), torch.full_like(first, torch.inf)
+        rows = first.isfinite().nonzero()[:, 0]
+        exits = torch.stack([leaving(rays, box) for box in self.boxes]).amax(0)
+        sampler, most, found = self._within(exits), _FIRST, []
+        while len(rows):
+            some = rays[rows]
+            t0, t1, counts = sampler.onward(some, t[rows], most)
+            here = t0.isfinite()
+            ids = torch.repeat_interleave(torch.arange(len(rows)), counts)
+            s0, s1, d = t0[here], t1[here], some.directions[ids]
+            sigma, rgb = self.field(some.origins[ids] + d * ((s0 + s1) / 2)[:, None], d)
+            found.append((s0, s1, sigma, rgb, rows[ids]))
+            depth.index_add_(0, rows[ids], sigma * (s1 - s0))
+            t[rows] = t1[:, -1]
+            opaque, more = depth[rows] >= STOP, counts == most
+            until[rows[opaque]] = t1.where(here, -torch.inf).amax(-1)[opaque]
+            rows, most = rows[more & ~opaque], min(2 * most, _MOST)
+        return _in_order(found, len(first)), until
+
+    def _within(self, exits: Tensor) -> OccupancySampler:
+        """The sampler of what changed, no further than rays are in the boxes."""
+        return replace(self.told, far=min(float(exits.max()) / self.told.contraction.radius, self.told.far))
+
+    def _asked(self, rays: Rays, sampler: OccupancySampler):  # type: ignore[no-untyped-def]
+        """What kernels want to know."""
+        base, space = self.base, (sampler.contraction.centre, sampler.contraction.radius)
+        field = (base.encoding.tables, base.encoding.resolutions, base.networks)
+        lines = (rays.origins, rays.directions, rays.origins.new_zeros(len(rays)))
+        return lines, space, sampler.grid, sampler.lattice, field, STOP, sampler.fine
+
+
+def lights_of(lights: Sequence[Relighting]) -> Lights:
+    """One light after the other, as kernels take them."""
+    if not lights:
+        return NO_LIGHTS
+    shapes = torch.tensor([light.log_gain.shape[:3] for light in lights])
+    firsts = torch.cat([shapes.new_zeros(1), shapes.prod(-1).cumsum(0)[:-1]])
+    boxes = torch.stack([light.aabb.float() for light in lights])
+    return Lights(boxes, shapes, firsts, torch.cat([light.log_gain.reshape(-1, 3).float() for light in lights]))
+
+
+def _in_order(found: list[tuple[Tensor, ...]], count: int) -> Shown:
+    """Samples (starts, ends, densities, colours, rays) found in rounds, packed by ray."""
+    if not found:
+        none = torch.zeros(0)
+        return none, none, none, torch.zeros(0, 3), torch.zeros(count + 1, dtype=torch.long)
+    t0, t1, sigma, rgb, ids = (torch.cat(parts) for parts in zip(*found))
+    order = torch.argsort(ids, stable=True)
+    counts = torch.bincount(ids, minlength=count)
+    return t0[order], t1[order], sigma[order], rgb[order], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
