@@ -53,8 +53,8 @@ class OccupancySampler:
     def onward(self, rays: Rays, t: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:
         """The next samples of N rays that have come to t (N,), ``most`` of each: see `kernels.next_samples`."""
         with torch.no_grad():
-            lines, *where = self._question(rays, False)
-            return kernels.next_samples(lines, *where, t, most, self.fine)
+            lines, space, grid, lattice = self._question(rays, False)
+            return kernels.next_samples(lines, space, grid, lattice, t, most, self.fine)
 
     def first(self, rays: Rays) -> Tensor:
         """Where the first sample of each of N rays begins, (N,); infinite where there is none."""

@@ -232,11 +232,9 @@ class UpdatedField:
             return None
         if self._view_of is None or self._view_of[0] is not self.sampler.grid:
             known, told = self._split
-            was = self._base.sampler
-            unknown = ((was.grid > 0) & (known.grid == 0)).to(torch.uint8)
-            known = replace(known, grid=known.grid * (was.grid > 0), fine=was.fine)
+            gone = ((self._base.sampler.grid > 0) & (known.grid == 0)).to(torch.uint8)
             lights = [layer.light for layer in layers_of(self) if layer.light is not None]
-            view = View(self._base, unknown, known, told, self._marched, lights_of(lights[::-1]), self)
+            view = View(self._base, gone, told, self._marched, lights_of(lights[::-1]), self)
             self._view_of = self.sampler.grid, view
         return self._view_of[1]
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.kernels.onward import NO_LIGHTS, Lights, Shown, Way, summed
+from refield.field.kernels.reference import Lattice, Networks, Rays3, Space
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP, OccupancySampler
 from refield.field.volrend import Rendering
@@ -32,8 +33,6 @@ class View:
     """shows what never changed"""
     gone: Tensor
     """(R, R, R) uint8: cells of which the base does not know, or knows no longer, what is in them"""
-    known: OccupancySampler
-    """looks into all others"""
     told: OccupancySampler
     """looks into those that changed"""
     boxes: tuple[Tensor, ...]
@@ -47,32 +46,29 @@ class View:
         """What N rays see; ``chunk`` of them are worked on at once."""
         with torch.no_grad():
             begun = [self._begun(rays[i : i + chunk]) for i in range(0, max(len(rays), 1), chunk)]
-            sums, t, depth, first = (torch.cat(parts) for parts in zip(*begun))
-            under_way = (t < self.known.lattice[1]) & (depth < STOP)
+            sums, first = (torch.cat(parts) for parts in ([b[0] for b in begun], [b[2] for b in begun]))
+            t, depth = (torch.cat(parts) for parts in ([b[1].t for b in begun], [b[1].depth for b in begun]))
+            under_way = first.isfinite() & (depth < STOP)
             for rows in under_way.nonzero()[:, 0].split(chunk):
-                sums[rows] = self._ended(rays[rows], sums[rows], t[rows], depth[rows], first[rows])
+                way = Way(t[rows], torch.full_like(t[rows], torch.inf), depth[rows], self.gone)
+                sums[rows] = self._ended(rays[rows], sums[rows], way, first[rows])
         return Rendering(*summed(sums))
 
-    def _begun(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As far as the base alone shows anything: sums (N, 7), where rays have come to and their optical depth (N,)
-        each; and where the first sample of what changed begins, (N,), infinite where there is none."""
+    def _begun(self, rays: Rays) -> tuple[Tensor, Way, Tensor]:
+        """As far as the base alone shows anything: sums (N, 7), the rays' way to there, and where the first sample of
+        what changed begins, (N,), infinite where there is none."""
         exits = torch.stack([leaving(rays, box) for box in self.boxes]).amax(0)
         near = (exits > 0).nonzero()[:, 0]
         first = torch.full_like(exits, torch.inf)
         if len(near):
             first[near] = self._within(exits).first(rays[near])
-        way = Way(torch.full_like(first, self.known.near), first, torch.zeros_like(first), self.gone)
-        sums = kernels.render_until(*self._asked(rays, self.base.sampler), way, self.lights)
-        return sums, way.t, way.depth, first
+        way = Way(torch.full_like(first, self.base.sampler.near), first, torch.zeros_like(first), self.gone)
+        return kernels.render_until(*self._asked(rays), way, self.lights), way, first
 
-    def _ended(self, rays: Rays, sums: Tensor, t: Tensor, depth: Tensor, first: Tensor) -> Tensor:
-        """The sums (N, 7) of rays that have come to something else, when they are opaque or see nothing more."""
-        told, until = self._told_on(rays, first, depth)
-        nowhere = self.gone.new_zeros(0, 0, 0)
-        known = kernels.shown_on(
-            *self._asked(rays, self.known), Way(t.clone(), until, depth.clone(), nowhere), self.lights
-        )
-        return kernels.blend(sums, known, told)
+    def _ended(self, rays: Rays, sums: Tensor, way: Way, first: Tensor) -> Tensor:
+        """The sums (N, 7) of rays that have come to what changed, when they are opaque or see nothing more."""
+        told, until = self._told_on(rays, first, way.depth)
+        return kernels.blend(sums, kernels.shown_on(*self._asked(rays), way._replace(until=until), self.lights), told)
 
     def _told_on(self, rays: Rays, first: Tensor, depth: Tensor) -> tuple[Shown, Tensor]:
         """What changed along rays with an optical depth (N,) behind them, from its first sample on until it alone is
@@ -100,12 +96,15 @@ class View:
         """The sampler of what changed, no further than rays are in the boxes."""
         return replace(self.told, far=min(float(exits.max()) / self.told.contraction.radius, self.told.far))
 
-    def _asked(self, rays: Rays, sampler: OccupancySampler):  # type: ignore[no-untyped-def]
-        """What kernels want to know."""
-        base, space = self.base, (sampler.contraction.centre, sampler.contraction.radius)
-        field = (base.encoding.tables, base.encoding.resolutions, base.networks)
+    def _asked(
+        self, rays: Rays
+    ) -> tuple[Rays3, Space, Tensor, Lattice, tuple[Tensor, tuple[int, ...], Networks], float, Tensor | None]:
+        """What kernels want to know of rays and the base."""
+        base, sampler = self.base, self.base.sampler
+        space = (sampler.contraction.centre, sampler.contraction.radius)
+        net = (base.encoding.tables, base.encoding.resolutions, base.networks)
         lines = (rays.origins, rays.directions, rays.origins.new_zeros(len(rays)))
-        return lines, space, sampler.grid, sampler.lattice, field, STOP, sampler.fine
+        return lines, space, sampler.grid, sampler.lattice, net, STOP, sampler.fine
 
 
 def lights_of(lights: Sequence[Relighting]) -> Lights:
@@ -118,7 +117,7 @@ def lights_of(lights: Sequence[Relighting]) -> Lights:
     return Lights(boxes, shapes, firsts, torch.cat([light.log_gain.reshape(-1, 3).float() for light in lights]))
 
 
-def _in_order(found: list[tuple[Tensor, ...]], count: int) -> Shown:
+def _in_order(found: Sequence[tuple[Tensor, ...]], count: int) -> Shown:
     """Samples (starts, ends, densities, colours, rays) found in rounds, packed by ray."""
     if not found:
         none = torch.zeros(0)

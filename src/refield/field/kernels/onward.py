@@ -23,14 +23,14 @@ class Way(NamedTuple):
     """How far rays have come, and how far they go."""
 
     t: Tensor
-    """(N,) float32 where each is: the lattice's next interval begins there. Overwritten by where it ended"""
+    """(N,) float32 where each is: the lattice's next interval begins there. Overwritten by the end of its last sample, or
+    somewhere behind ``until``"""
     until: Tensor
     """(N,) float32; no interval begins there or beyond"""
     depth: Tensor
     """(N,) float32 optical depth behind it. Overwritten, likewise"""
     gone: Tensor
-    """(R, R, R) uint8 over contracted space: a ray ends before its first sample in a cell that is not 0. (0, 0, 0) for
-    none"""
+    """(R, R, R) uint8 over contracted space: samples in cells that are not 0 are left out"""
 
 
 class Lights(NamedTuple):
@@ -106,19 +106,13 @@ def shown_on(
     raw, rgb = reference.hash_field(unit, directions[ids], tables, resolutions, networks)
     sigma = truncated_exp(raw) / space[1]
     kept = t0 < way.until[ids]
-    if way.gone.numel():
-        i, j, k = (unit * way.gone.shape[0]).long().clamp(0, way.gone.shape[0] - 1).unbind(-1)
-        met = way.gone[i, j, k] > 0
-        kept &= reference._exclusive_sum(met.float(), offsets) + met == 0
+    i, j, k = (unit * way.gone.shape[0]).long().clamp(0, way.gone.shape[0] - 1).unbind(-1)
+    kept &= way.gone[i, j, k] == 0
     tau = torch.where(kept, sigma * (t1 - t0), 0.0)
-    open_yet = way.depth[ids] + reference._exclusive_sum(tau, offsets) < stop
-    ended = ~kept & open_yet
-    kept &= open_yet
+    kept &= way.depth[ids] + reference._exclusive_sum(tau, offsets) < stop
     counts = torch.zeros_like(offsets[1:]).index_add(0, ids, kept.long())
-    way.t.index_reduce_(0, ids[kept], t1[kept], "amax")
-    first = torch.full_like(way.t, torch.inf).index_reduce(0, ids[ended], t0[ended], "amin")
-    way.t.copy_(torch.where(first.isfinite(), first, way.t))
-    way.depth.index_add_(0, ids[kept], tau[kept])
+    way.depth.index_add_(0, ids, torch.where(kept, tau, 0.0))
+    way.t.copy_(torch.where(way.depth < stop, way.until, way.t.index_reduce(0, ids[kept], t1[kept], "amax")))
     rgb = relight(mid, rgb, lights)
     return t0[kept], t1[kept], sigma[kept], rgb[kept], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
 
@@ -140,8 +134,8 @@ def render_until(
         shown = shown_on(rays, space, grid, lattice, field, stop, fine, way, lights)
         start = torch.zeros(len(way.t), 7, device=way.t.device)
         start[:, 6] = 1
-        nothing = tuple(t[:0] for t in shown[:4])
-        return blend(start, shown, (*nothing, torch.zeros_like(shown[4])))
+        t0, t1, sigma, rgb, offsets = shown
+        return blend(start, shown, (t0[:0], t1[:0], sigma[:0], rgb[:0], torch.zeros_like(offsets)))
 
 
 def blend(sums: Tensor, a: Shown, b: Shown) -> Tensor:

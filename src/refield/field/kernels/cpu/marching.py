@@ -148,7 +148,9 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, way, arena):  # typ
         for a in range(living):
             r = alive[a]
             t[r], dt = next_sample(lines[r], t[r], far[r], step, grids, unit[total + m])
-            if dt > 0 and not (len(gone) > 0 and _inside(unit[total + m], gone)):
+            while dt > 0 and len(gone) > 0 and _inside(unit[total + m], gone):
+                t[r], dt = next_sample(lines[r], t[r] + dt, far[r], step, grids, unit[total + m])
+            if dt > 0:
                 t0[total + m], t1[total + m], owner[total + m] = t[r], t[r] + dt, begin + r
                 t[r] += dt
                 alive[m] = r
