@@ -31,7 +31,7 @@ from refield.scene.pose import rotate, transform
 from refield.update.light import Relighting
 from refield.update.region import Region, carved, finer, grown, move_out
 from refield.update.textured import TexturedPlane
-from refield.update.view import View, lights_of
+from refield.update.view import View, around, lights_of
 
 DILATION = 2.0
 """M_out is the object's grid, its box this many times as large (§10.1.3: 2 to 3)."""
@@ -234,7 +234,8 @@ class UpdatedField:
             known, told = self._split
             gone = ((self._base.sampler.grid > 0) & (known.grid == 0)).to(torch.uint8)
             lights = [layer.light for layer in layers_of(self) if layer.light is not None]
-            view = View(self._base, gone, told, self._marched, lights_of(lights[::-1]), self)
+            boxes = tuple(tight for box in self._marched if (tight := around(told, box)) is not None)
+            view = View(self._base, gone, told, boxes, lights_of(lights[::-1]), self)
             self._view_of = self.sampler.grid, view
         return self._view_of[1]
 

@@ -22,7 +22,7 @@ from refield.field.warp import leaving
 from refield.scene.capture import Rays
 from refield.update.light import Relighting
 
-_FIRST, _MOST = 4, 32  # samples of what changed that a ray is asked for at once, at first and later
+_FIRST, _MOST = 2, 4  # samples of what changed that a ray is asked for at once, at first and later
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class View:
     def _begun(self, rays: Rays) -> tuple[Tensor, Way, Tensor]:
         """As far as the base alone shows anything: sums (N, 7), the rays' way to there, and where the first sample of
         what changed begins, (N,), infinite where there is none."""
-        exits = torch.stack([leaving(rays, box) for box in self.boxes]).amax(0)
+        exits = self._exits(rays)
         near = (exits > 0).nonzero()[:, 0]
         first = torch.full_like(exits, torch.inf)
         if len(near):
@@ -75,7 +75,7 @@ class View:
         opaque; and from where on nothing else is seen, (N,)."""
         t, depth, until = first.clone(), depth.clone(), torch.full_like(first, torch.inf)
         rows = first.isfinite().nonzero()[:, 0]
-        exits = torch.stack([leaving(rays, box) for box in self.boxes]).amax(0)
+        exits = self._exits(rays)
         sampler, most, found = self._within(exits), _FIRST, []
         while len(rows):
             some = rays[rows]
@@ -91,6 +91,10 @@ class View:
             until[rows[opaque]] = t1.where(here, -torch.inf).amax(-1)[opaque]
             rows, most = rows[more & ~opaque], min(2 * most, _MOST)
         return _in_order(found, len(first)), until
+
+    def _exits(self, rays: Rays) -> Tensor:
+        """Where each ray leaves the last box, (N,); 0 if it meets none."""
+        return torch.stack([torch.zeros_like(rays.origins[:, 0]), *(leaving(rays, box) for box in self.boxes)]).amax(0)
 
     def _within(self, exits: Tensor) -> OccupancySampler:
         """The sampler of what changed, no further than rays are in the boxes."""
@@ -108,13 +112,24 @@ class View:
 
 
 def lights_of(lights: Sequence[Relighting]) -> Lights:
-    """One light after the other, as kernels take them."""
+    """One light after the other, as kernels take them; no larger than where there is any."""
+    lights = [cropped for light in lights if (cropped := light.cropped()) is not None]
     if not lights:
         return NO_LIGHTS
     shapes = torch.tensor([light.log_gain.shape[:3] for light in lights])
     firsts = torch.cat([shapes.new_zeros(1), shapes.prod(-1).cumsum(0)[:-1]])
     boxes = torch.stack([light.aabb.float() for light in lights])
     return Lights(boxes, shapes, firsts, torch.cat([light.log_gain.reshape(-1, 3).float() for light in lights]))
+
+
+def around(sampler: OccupancySampler, box: Tensor) -> Tensor | None:
+    """A world box (2, 3) around the occupied cells of a sampler in another; None if there are none."""
+    cells = sampler.cells_in(box)
+    cells = cells[sampler.grid.view(-1)[cells] > 0]
+    if len(cells) == 0:
+        return None
+    x, half = sampler.points_in(cells, jitter=False), sampler.width(sampler.distance(cells))[:, None]
+    return torch.stack([(x - half).amin(0), (x + half).amax(0)])
 
 
 def _in_order(found: Sequence[tuple[Tensor, ...]], count: int) -> Shown:

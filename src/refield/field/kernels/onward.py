@@ -23,8 +23,8 @@ class Way(NamedTuple):
     """How far rays have come, and how far they go."""
 
     t: Tensor
-    """(N,) float32 where each is: the lattice's next interval begins there. Overwritten by the end of its last sample, or
-    somewhere behind ``until``"""
+    """(N,) float32 where each is: the lattice's next interval begins there. Overwritten by the end of its last sample,
+    or somewhere behind ``until``"""
     until: Tensor
     """(N,) float32; no interval begins there or beyond"""
     depth: Tensor

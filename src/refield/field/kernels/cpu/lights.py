@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit, prange
 from torch import Tensor
 
 from refield.field.kernels.cpu.encoding import array
-from refield.field.kernels.cpu.simd import JIT
+from refield.field.kernels.cpu.simd import JIT, exp
 from refield.field.kernels.onward import Lights
-from refield.scene.inside import cell_along
+
+_ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+@njit(forceinline=True, **JIT)
+def _along(x, low, high, nodes):  # type: ignore[no-untyped-def]
+    """`scene.inside.cell_along` in single precision."""
+    at = (x - low) / (high - low) * np.float32(nodes - 1)
+    if not (at >= _ZERO and at <= np.float32(nodes - 1)):
+        return -1, at
+    node = min(int(at), nodes - 2)
+    return node, at - np.float32(node)
 
 
 @njit(**JIT)
@@ -19,21 +28,24 @@ def shine(x, y, z, lights, rgb):  # type: ignore[no-untyped-def]
     """`onward.relight` of one colour (3,), in place."""
     boxes, shapes, firsts, logs = lights
     for l in range(len(boxes)):
-        i, u = cell_along(x, boxes[l, 0, 0], boxes[l, 1, 0], shapes[l, 0])
-        j, v = cell_along(y, boxes[l, 0, 1], boxes[l, 1, 1], shapes[l, 1])
-        k, w = cell_along(z, boxes[l, 0, 2], boxes[l, 1, 2], shapes[l, 2])
+        i, u = _along(x, boxes[l, 0, 0], boxes[l, 1, 0], shapes[l, 0])
+        j, v = _along(y, boxes[l, 0, 1], boxes[l, 1, 1], shapes[l, 1])
+        k, w = _along(z, boxes[l, 0, 2], boxes[l, 1, 2], shapes[l, 2])
         if i < 0 or j < 0 or k < 0:
             continue
-        red = green = blue = np.float32(0)
-        for corner in range(8):
-            a, b, c = corner >> 2 & 1, corner >> 1 & 1, corner & 1
-            weight = np.float32((u if a else 1 - u) * (v if b else 1 - v) * (w if c else 1 - w))
-            row = firsts[l] + ((i + a) * shapes[l, 1] + j + b) * shapes[l, 2] + k + c
-            red, green, blue = red + weight * logs[row, 0], green + weight * logs[row, 1], blue + weight * logs[row, 2]
+        red = green = blue = _ZERO
+        for a in range(2):
+            for b in range(2):
+                side = (u if a else _ONE - u) * (v if b else _ONE - v)
+                row = firsts[l] + ((i + a) * shapes[l, 1] + j + b) * shapes[l, 2] + k
+                near, far = side * (_ONE - w), side * w
+                red += near * logs[row, 0] + far * logs[row + 1, 0]
+                green += near * logs[row, 1] + far * logs[row + 1, 1]
+                blue += near * logs[row, 2] + far * logs[row + 1, 2]
         if red != 0 or green != 0 or blue != 0:
-            rgb[0] = min(max(rgb[0] * np.float32(math.exp(red)), np.float32(0)), np.float32(1))
-            rgb[1] = min(max(rgb[1] * np.float32(math.exp(green)), np.float32(0)), np.float32(1))
-            rgb[2] = min(max(rgb[2] * np.float32(math.exp(blue)), np.float32(0)), np.float32(1))
+            rgb[0] = min(max(rgb[0] * exp(red), _ZERO), _ONE)
+            rgb[1] = min(max(rgb[1] * exp(green), _ZERO), _ONE)
+            rgb[2] = min(max(rgb[2] * exp(blue), _ZERO), _ONE)
 
 
 @njit(parallel=True, **JIT)
