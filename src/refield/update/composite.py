@@ -26,12 +26,12 @@ from refield.field.volrend import Rendering, Samples, interleaved
 from refield.field.warp import Move, inside_box, leaving, looked_up, moves_of, owners
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
-from refield.scene.inside import in_boxes
+from refield.scene.inside import in_boxes, spans
 from refield.scene.pose import rotate, transform
 from refield.update.light import Relighting
 from refield.update.region import Region, carved, finer, grown, move_out
 from refield.update.textured import TexturedPlane
-from refield.update.view import View, around, lights_of
+from refield.update.view import View, boxes_around, lights_of
 
 DILATION = 2.0
 """M_out is the object's grid, its box this many times as large (§10.1.3: 2 to 3)."""
@@ -234,8 +234,7 @@ class UpdatedField:
             known, told = self._split
             gone = ((self._base.sampler.grid > 0) & (known.grid == 0)).to(torch.uint8)
             lights = [layer.light for layer in layers_of(self) if layer.light is not None]
-            boxes = tuple(tight for box in self._marched if (tight := around(told, box)) is not None)
-            view = View(self._base, gone, told, boxes, lights_of(lights[::-1]), self)
+            view = View(self._base, gone, told, boxes_around(told, self._marched), lights_of(lights[::-1]), self)
             self._view_of = self.sampler.grid, view
         return self._view_of[1]
 
@@ -245,11 +244,9 @@ class UpdatedField:
         cells, boxes = self._changed
         same = torch.ones(len(rays), dtype=torch.bool, device=rays.origins.device)
         if boxes:
-            exits = torch.stack([leaving(rays, box) for box in boxes]).amax(0)
-            near = (exits > 0).nonzero()[:, 0]
-            if len(near):
-                far = float(exits.max()) / cells.contraction.radius
-                same[near] = replace(cells, far=min(far, cells.far)).first(rays[near]).isinf()
+            enter, leave = spans(rays, torch.stack(boxes))
+            near = (leave > 0).nonzero()[:, 0]
+            same[near] = cells.first(rays[near], enter[near], leave[near]).isinf()
         return self.pretrained, same
 
     @property

@@ -7,7 +7,7 @@ what changed is asked for a few samples at a time, until it is opaque, and then 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -18,8 +18,8 @@ from refield.field.kernels.reference import Lattice, Networks, Rays3, Space
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP, OccupancySampler
 from refield.field.volrend import Rendering
-from refield.field.warp import leaving
 from refield.scene.capture import Rays
+from refield.scene.inside import spans
 from refield.update.light import Relighting
 
 _FIRST, _MOST = 2, 4  # samples of what changed that a ray is asked for at once, at first and later
@@ -35,8 +35,8 @@ class View:
     """(R, R, R) uint8: cells of which the base does not know, or knows no longer, what is in them"""
     told: OccupancySampler
     """looks into those that changed"""
-    boxes: tuple[Tensor, ...]
-    """(2, 3) world, which hold all cells that changed"""
+    boxes: Tensor
+    """(B, 2, 3) world, which hold all cells that changed"""
     lights: Lights
     """on what never changed"""
     field: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -57,11 +57,10 @@ class View:
     def _begun(self, rays: Rays) -> tuple[Tensor, Way, Tensor]:
         """As far as the base alone shows anything: sums (N, 7), the rays' way to there, and where the first sample of
         what changed begins, (N,), infinite where there is none."""
-        exits = self._exits(rays)
-        near = (exits > 0).nonzero()[:, 0]
-        first = torch.full_like(exits, torch.inf)
-        if len(near):
-            first[near] = self._within(exits).first(rays[near])
+        enter, leave = spans(rays, self.boxes)
+        near = (leave > 0).nonzero()[:, 0]
+        first = torch.full_like(leave, torch.inf)
+        first[near] = self.told.first(rays[near], enter[near], leave[near])
         way = Way(torch.full_like(first, self.base.sampler.near), first, torch.zeros_like(first), self.gone)
         return kernels.render_until(*self._asked(rays), way, self.lights), way, first
 
@@ -75,11 +74,10 @@ class View:
         opaque; and from where on nothing else is seen, (N,)."""
         t, depth, until = first.clone(), depth.clone(), torch.full_like(first, torch.inf)
         rows = first.isfinite().nonzero()[:, 0]
-        exits = self._exits(rays)
-        sampler, most, found = self._within(exits), _FIRST, []
+        leave, most, found = spans(rays, self.boxes)[1], _FIRST, []
         while len(rows):
             some = rays[rows]
-            t0, t1, counts = sampler.onward(some, t[rows], most)
+            t0, t1, counts = self.told.onward(some, (t[rows], first[rows], leave[rows]), most)
             here = t0.isfinite()
             ids = torch.repeat_interleave(torch.arange(len(rows)), counts)
             s0, s1, d = t0[here], t1[here], some.directions[ids]
@@ -91,14 +89,6 @@ class View:
             until[rows[opaque]] = t1.where(here, -torch.inf).amax(-1)[opaque]
             rows, most = rows[more & ~opaque], min(2 * most, _MOST)
         return _in_order(found, len(first)), until
-
-    def _exits(self, rays: Rays) -> Tensor:
-        """Where each ray leaves the last box, (N,); 0 if it meets none."""
-        return torch.stack([torch.zeros_like(rays.origins[:, 0]), *(leaving(rays, box) for box in self.boxes)]).amax(0)
-
-    def _within(self, exits: Tensor) -> OccupancySampler:
-        """The sampler of what changed, no further than rays are in the boxes."""
-        return replace(self.told, far=min(float(exits.max()) / self.told.contraction.radius, self.told.far))
 
     def _asked(
         self, rays: Rays
@@ -122,14 +112,16 @@ def lights_of(lights: Sequence[Relighting]) -> Lights:
     return Lights(boxes, shapes, firsts, torch.cat([light.log_gain.reshape(-1, 3).float() for light in lights]))
 
 
-def around(sampler: OccupancySampler, box: Tensor) -> Tensor | None:
-    """A world box (2, 3) around the occupied cells of a sampler in another; None if there are none."""
-    cells = sampler.cells_in(box)
-    cells = cells[sampler.grid.view(-1)[cells] > 0]
-    if len(cells) == 0:
-        return None
-    x, half = sampler.points_in(cells, jitter=False), sampler.width(sampler.distance(cells))[:, None]
-    return torch.stack([(x - half).amin(0), (x + half).amax(0)])
+def boxes_around(sampler: OccupancySampler, boxes: Sequence[Tensor]) -> Tensor:
+    """World boxes (B, 2, 3) around the occupied cells of a sampler in each of some others that holds any."""
+    out = []
+    for box in boxes:
+        cells = sampler.cells_in(box)
+        cells = cells[sampler.grid.view(-1)[cells] > 0]
+        if len(cells):
+            x, half = sampler.points_in(cells, jitter=False), sampler.width(sampler.distance(cells))[:, None]
+            out.append(torch.stack([(x - half).amin(0), (x + half).amax(0)]))
+    return torch.stack(out) if out else torch.zeros(0, 2, 3)
 
 
 def _in_order(found: Sequence[tuple[Tensor, ...]], count: int) -> Shown:

@@ -12,7 +12,7 @@ from types import ModuleType
 from torch import Tensor
 
 from refield.field.kernels import onward, reference
-from refield.field.kernels.onward import Lights, Shown, Way
+from refield.field.kernels.onward import Lights, Shown, Span, Way
 from refield.field.kernels.reference import (
     Aim,
     Batch,
@@ -121,10 +121,10 @@ def render(
 
 
 def next_samples(
-    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, t: Tensor, most: int, fine: Tensor | None = None
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, span: Span, most: int, fine: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `onward.next_samples`."""
-    return _further(grid).next_samples(rays, space, grid, lattice, t, most, fine)
+    return _further(grid).next_samples(rays, space, grid, lattice, span, most, fine)
 
 
 def render_until(

@@ -19,6 +19,11 @@ Shown = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 """t_starts (S,), t_ends (S,), densities (S,) per world unit, colours (S, 3), offsets (N + 1,)"""
 
 
+Span = tuple[Tensor, Tensor, Tensor]
+"""(N,) float32 each: where rays are on the lattice; and from where to where it is of interest what they meet, infinite
+and 0 where nothing is. Samples elsewhere may be left out"""
+
+
 class Way(NamedTuple):
     """How far rays have come, and how far they go."""
 
@@ -52,16 +57,21 @@ NO_LIGHTS = Lights(
 
 
 def next_samples(
-    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, t: Tensor, most: int, fine: Tensor | None = None
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, span: Span, most: int, fine: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """As `reference.march`, but from where each ray is, t (N,), and the next M = ``most`` samples at most.
+    """As `reference.march`, but from where each ray is, and the next M = ``most`` samples at most.
 
     Returns t_starts (N, M) and t_ends (N, M), infinite where a ray has no more, and how many each has, (N,) int64. A
     ray goes on from the end of its last sample.
     """
     near, _, step = lattice
+    t, enter, leave = span
     t0, t1, offsets = reference.march((rays[0], rays[1], (t - near) / step), space, grid, lattice, fine)
-    counts = offsets.diff().clamp(max=most)
+    ids = reference._ray_ids(offsets)
+    kept = (t1 > enter[ids]) & (t0 < leave[ids])
+    counts = torch.zeros_like(offsets[1:]).index_add(0, ids, kept.long())
+    t0, t1, offsets = t0[kept], t1[kept], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    counts = counts.clamp(max=most)
     out = torch.full((2, len(t), most), torch.inf, device=t.device)
     for m in range(most):
         rows = (counts > m).nonzero()[:, 0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from numba import njit, prange
@@ -15,7 +17,7 @@ from refield.field.kernels.cpu.networks import forward_all, pack, sizes_of
 from refield.field.kernels.cpu.rendering import composited
 from refield.field.kernels.cpu.simd import JIT, exp
 from refield.field.kernels.cpu.walk import next_sample, start
-from refield.field.kernels.onward import Lights, Shown, Way
+from refield.field.kernels.onward import Lights, Shown, Span, Way
 from refield.field.kernels.reference import TRACE, Lattice, Networks, Rays3, Space
 
 _ZERO, _ONE, _TWO, _TRACE = np.float32(0), np.float32(1), np.float32(2), np.float32(TRACE)
@@ -23,12 +25,30 @@ _SOME = 64  # rays that a thread takes at once
 
 
 @njit(**JIT)
-def _next_part(begin, end, rays, space, grids, lattice, at, t0, t1, counts):  # type: ignore[no-untyped-def]
-    far, step, most = np.float32(lattice[1]), np.float32(lattice[2]), t0.shape[1]
+def _skipped(ray, t, step, enter):  # type: ignore[no-untyped-def]
+    """The lattice's last place from ``t`` on that lies before ``enter``, or one somewhat before; see `walk.start`."""
+    while True:
+        m = max(abs(ray[0] + ray[3] * t), max(abs(ray[1] + ray[4] * t), abs(ray[2] + ray[5] * t)))
+        if m > _ONE:
+            dt = step * m * np.float32(math.sqrt(m))
+        else:  # a hair is kept back for rounding
+            clear = min(enter - t, (_ONE - m) * ray[9])
+            dt = step * max(np.float32(math.floor(clear * ray[10] - np.float32(1e-3))), _ONE)
+        if not t + dt < enter:
+            return t
+        t += dt
+
+
+@njit(**JIT)
+def _next_part(begin, end, rays, space, grids, lattice, span, t0, t1, counts):  # type: ignore[no-untyped-def]
+    step, most = np.float32(lattice[2]), t0.shape[1]
+    at, enter, leave = span
     ray, unit = np.empty(11, np.float32), np.empty(3, np.float32)
     for r in range(begin, end):
         start(rays, space, lattice, np.float32(grids[0].shape[0] / 4), r, ray)
-        t, found = at[r], 0
+        t, found, far = at[r], 0, min(np.float32(lattice[1]), leave[r])
+        if enter[r] < far:
+            t = _skipped(ray, t, step, enter[r])
         while found < most:
             t, dt = next_sample(ray, t, far, step, grids, unit)
             if dt == 0:
@@ -41,20 +61,29 @@ def _next_part(begin, end, rays, space, grids, lattice, at, t0, t1, counts):  # 
 
 
 @njit(parallel=True, **JIT)
-def _next(rays, space, grids, lattice, at, t0, t1, counts):  # type: ignore[no-untyped-def]
-    n = len(at)
+def _next(rays, space, grids, lattice, span, t0, t1, counts):  # type: ignore[no-untyped-def]
+    n = len(counts)
     for b in prange((n + _SOME - 1) // _SOME):
-        _next_part(b * _SOME, min(n, (b + 1) * _SOME), rays, space, grids, lattice, at, t0, t1, counts)
+        _next_part(b * _SOME, min(n, (b + 1) * _SOME), rays, space, grids, lattice, span, t0, t1, counts)
 
 
 def next_samples(
-    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, t: Tensor, most: int, fine: Tensor | None = None
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, span: Span, most: int, fine: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `onward.next_samples`."""
-    n = len(t)
+    n = len(span[0])
     t0, t1, counts = torch.empty(n, most), torch.empty(n, most), torch.empty(n, dtype=torch.long)
     arrays, place = tuple(array(r) for r in rays), (array(space[0].float()), np.float32(space[1]))
-    _next(arrays, place, grids_of(grid, fine), lattice, array(t), t0.numpy(), t1.numpy(), counts.numpy())
+    _next(
+        arrays,
+        place,
+        grids_of(grid, fine),
+        lattice,
+        tuple(array(s) for s in span),
+        t0.numpy(),
+        t1.numpy(),
+        counts.numpy(),
+    )
     return t0, t1, counts
 
 
