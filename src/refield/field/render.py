@@ -36,15 +36,16 @@ def render_many(field: Field, rays: Rays, chunk: int = CHUNK) -> Rendering:
     if whole is not None:
         return whole(rays, chunk)
     with torch.no_grad():
-        return Rendering.joined([_rendered(field, rays[i : i + chunk]) for i in range(0, max(len(rays), 1), chunk)])
+        parts = [_rendered(field, rays[i : i + chunk], chunk) for i in range(0, max(len(rays), 1), chunk)]
+        return Rendering.joined(parts)
 
 
-def _rendered(field: Field, rays: Rays) -> Rendering:
+def _rendered(field: Field, rays: Rays, chunk: int) -> Rendering:
     """Of one chunk."""
     unchanged: Callable[[Rays], tuple[Field, Tensor]] | None = getattr(field, "unchanged", None)
     if unchanged is None:
         return render_rays(field, rays)
-    return parted(*unchanged(rays), rays, len(rays), lambda rest: render_rays(field, rest))
+    return parted(*unchanged(rays), rays, chunk, lambda rest: render_rays(field, rest))
 
 
 def parted(before: Field, same: Tensor, rays: Rays, chunk: int, otherwise: Callable[[Rays], Rendering]) -> Rendering:

@@ -28,8 +28,8 @@ class Way(NamedTuple):
     """How far rays have come, and how far they go."""
 
     t: Tensor
-    """(N,) float32 where each is: the lattice's next interval begins there. Overwritten by the end of its last sample,
-    or somewhere behind ``until``"""
+    """(N,) float32 where each is: the lattice's next interval begins there. Overwritten by the end of the sample
+    in which it became opaque, or by a place behind ``until`` or ``far`` before which there is nothing more"""
     until: Tensor
     """(N,) float32; no interval begins there or beyond"""
     depth: Tensor
@@ -115,16 +115,19 @@ def shown_on(
     unit = (reference.contract(mid, *space) + 2) / 4
     raw, rgb = reference.hash_field(unit, directions[ids], tables, resolutions, networks)
     sigma = truncated_exp(raw) / space[1]
-    kept = t0 < way.until[ids]
+    until = way.until.clamp(max=lattice[1])
+    kept = t0 < until[ids]
     i, j, k = (unit * way.gone.shape[0]).long().clamp(0, way.gone.shape[0] - 1).unbind(-1)
     kept &= way.gone[i, j, k] == 0
     tau = torch.where(kept, sigma * (t1 - t0), 0.0)
     kept &= way.depth[ids] + reference._exclusive_sum(tau, offsets) < stop
     counts = torch.zeros_like(offsets[1:]).index_add(0, ids, kept.long())
     way.depth.index_add_(0, ids, torch.where(kept, tau, 0.0))
-    way.t.copy_(torch.where(way.depth < stop, way.until, way.t.index_reduce(0, ids[kept], t1[kept], "amax")))
     rgb = relight(mid, rgb, lights)
-    return t0[kept], t1[kept], sigma[kept], rgb[kept], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    t0, t1, offsets = t0[kept], t1[kept], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    rows = ((counts > 0) & (way.depth >= stop)).nonzero()[:, 0]
+    way.t.copy_(until.index_copy(0, rows, t1[offsets[1:][rows] - 1]))
+    return t0, t1, sigma[kept], rgb[kept], offsets
 
 
 def render_until(
