@@ -8,12 +8,14 @@ from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_many, render_rays
 from refield.field.volrend import Rendering
 from refield.field.warp import crosses, crossing
+from refield.scene.capture import Rays
 from refield.scene.change import ObjectChange, OccupancyGrid
 from refield.scene.inside import spans
+from refield.scene.pose import transform
 from refield.update.composite import UpdatedField
 from refield.update.light import Relighting
 from tests.update.test_composite import BESIDE, NEW, NEW_POSE, OLD, around
-from tests.update.worlds import BallWorld, at, change_of, grid_of, moved, views
+from tests.update.worlds import SPACE, STEP, Ball, BallWorld, at, change_of, grid_of, moved, views
 
 
 def slab() -> HashField:
@@ -60,6 +62,30 @@ def test_a_view_shows_what_the_field_says() -> None:
     assert (seen.rgb - plain).abs().amax(-1).gt(0.05).float().mean() > 0.1  # the change shows
     second = UpdatedField(field, change_of(moved(NEW, at(0.0, 0.9, 0.3)), ObjectChange("removed", grid_of(BESIDE))))
     assert_alike(second, render_many(second, views(64)))
+
+
+def test_what_is_smaller_than_a_cell_is_shown_where_it_went() -> None:
+    """At a cell's corner, so that no cell's centre is in it."""
+    cell = 4 * SPACE.radius / 64
+    tiny, there = Ball(at(4 * cell, 4 * cell, 4 * cell), 0.03), at(-4 * cell, -3 * cell, 4 * cell)
+    base = slab()
+    grid = torch.zeros_like(base.sampler.grid)
+    grid.view(-1)[base.sampler.cells_in(tiny.world_from_ball[:3, 3].float().expand(2, 3))] = 1
+    base.looking_where(grid)
+    field = UpdatedField(base, change_of(moved(tiny, there)))
+    centre, low = there[:3, 3].float(), torch.tensor([-0.04, 0.0, 0.04])
+    cells = field.sampler.cells(centre + torch.cartesian_prod(low, low, low)).unique()
+    shell = field.moves[0].grid.contains(transform(field.moves[0].old_from_new, field.sampler.points_in(cells, False)))
+    assert not shell.any()
+    rays = Rays(
+        torch.tensor([[0.0, -2.0, 1.0]]), torch.nn.functional.normalize(centre - torch.tensor([[0.0, -2.0, 1.0]]))
+    )
+    assert field.sampler.occupied(centre) and float(render_many(field, rays).opacity) > 0.1
+    samples = field.samples(rays)
+    x, _ = samples.positions(rays)
+    near = (x - centre).norm(dim=-1) < 0.04
+    assert near.any() and torch.allclose((samples.t_ends - samples.t_starts)[near], torch.tensor(STEP / 2), atol=1e-4)
+    assert_alike(field, render_many(field, views(64)))
 
 
 def test_chunks_do_not_matter() -> None:

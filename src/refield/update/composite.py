@@ -146,7 +146,11 @@ class UpdatedField:
         if sampler is None:
             sampler = self._without_unseen(pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES))
         self.sampler = sampler
-        self._retold = _widened(self._told)
+        small = self._small_cells(pretrained.sampler)
+        earlier_small = pretrained._small if isinstance(pretrained, UpdatedField) else small
+        self._small: Tensor = small | earlier_small
+        self._said = _widened(self._own) | small
+        self._retold = _widened(self._told) | self._small
         before = pretrained._marched if isinstance(pretrained, UpdatedField) else ()
         self._split_of: tuple[Tensor, tuple[OccupancySampler, OccupancySampler]] | None = None
         self._view_of: tuple[Tensor, View] | None = None
@@ -254,7 +258,7 @@ class UpdatedField:
         """Looks into the cells in which this visit says anything; and world boxes (2, 3) that hold them all. Kept,
         since marching remembers a grid."""
         if self._changed_of is None or self._changed_of[0] is not self.sampler.grid:
-            grid = _widened(self._own) | (self.sampler.grid != self.pretrained.sampler.grid).to(torch.uint8)
+            grid = self._said | (self.sampler.grid != self.pretrained.sampler.grid).to(torch.uint8)
             boxes = list(self.boxes)
             if self.light is not None:
                 grid |= self.light.cells(self.sampler)
@@ -302,6 +306,16 @@ class UpdatedField:
             if self.earlier.ground is not None:
                 empty.append(cells[to.ground[~self.earlier.ground.sampler.occupied(x[to.ground])]])
         return grid, torch.cat(empty).unique()
+
+    def _small_cells(self, sampler: OccupancySampler) -> Tensor:
+        """(R, R, R) uint8: cells that hold some of what this visit says, be it so small that their centres lie beside
+        it."""
+        x = [transform(move.new_from_old, move.grid.occupied()) for move in self._shells]
+        x += [grid.occupied() for grid in (*self.region.grids, *self.earlier.places.grids)]
+        x += [plane.nodes[plane.known.reshape(-1)] for plane in self.region.planes]
+        grid = torch.zeros_like(sampler.grid)
+        grid.view(-1)[sampler.cells(torch.cat(x)) if x else []] = 1
+        return grid
 
     def density(self, x: Tensor) -> Tensor:
         """World points (..., 3) -> sigma (...,), per world unit."""
