@@ -22,7 +22,7 @@ from refield.scene.capture import Rays
 from refield.scene.inside import spans
 from refield.update.light import Relighting
 
-_FIRST, _MOST = 2, 4  # samples of what changed that a ray is asked for at once, at first and later
+_SOME = 4  # samples of what changed that are asked for at once on a ray; a surface is about so many thick
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,10 @@ class View:
         opaque; and from where on nothing else is seen, (N,)."""
         t, depth, until = first.clone(), depth.clone(), torch.full_like(first, torch.inf)
         rows = first.isfinite().nonzero()[:, 0]
-        leave, most, found = spans(rays, self.boxes)[1], _FIRST, []
+        leave, found = spans(rays, self.boxes)[1], []
         while len(rows):
             some = rays[rows]
-            t0, t1, counts = self.told.onward(some, (t[rows], first[rows], leave[rows]), most)
+            t0, t1, counts = self.told.onward(some, (t[rows], first[rows], leave[rows]), _SOME)
             here = t0.isfinite()
             ids = torch.repeat_interleave(torch.arange(len(rows)), counts)
             s0, s1, d = t0[here], t1[here], some.directions[ids]
@@ -85,9 +85,9 @@ class View:
             found.append((s0, s1, sigma, rgb, rows[ids]))
             depth.index_add_(0, rows[ids], sigma * (s1 - s0))
             t[rows] = t1[:, -1]
-            opaque, more = depth[rows] >= STOP, counts == most
+            opaque, more = depth[rows] >= STOP, counts == _SOME
             until[rows[opaque]] = t1.where(here, -torch.inf).amax(-1)[opaque]
-            rows, most = rows[more & ~opaque], min(2 * most, _MOST)
+            rows = rows[more & ~opaque]
         return _in_order(found, len(first)), until
 
     def _asked(
