@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from refield.field.radiance import HashField, HashFieldConfig
@@ -72,7 +74,9 @@ def test_what_is_smaller_than_a_cell_is_shown_where_it_went() -> None:
     grid = torch.zeros_like(base.sampler.grid)
     grid.view(-1)[base.sampler.cells_in(tiny.world_from_ball[:3, 3].float().expand(2, 3))] = 1
     base.looking_where(grid)
-    field = UpdatedField(base, change_of(moved(tiny, there)))
+    now = torch.zeros_like(grid)
+    now.view(-1)[base.sampler.cells_in(there[:3, 3].float().expand(2, 3))] = 1
+    field = UpdatedField(base, change_of(moved(tiny, there)), sampler=replace(base.sampler, grid=now))
     centre, low = there[:3, 3].float(), torch.tensor([-0.04, 0.0, 0.04])
     cells = field.sampler.cells(centre + torch.cartesian_prod(low, low, low)).unique()
     shell = field.moves[0].grid.contains(transform(field.moves[0].old_from_new, field.sampler.points_in(cells, False)))
