@@ -103,9 +103,8 @@ def _find_nearest(
         best, which, any_best, any_which = -2.0, -1, -2.0, 0
         for w in range(len(ways)):
             along = d[s, 0] * ways[w, 0] + d[s, 1] * ways[w, 1] + d[s, 2] * ways[w, 2]
-            facing = -(n[0] * ways[w, 0] + n[1] * ways[w, 1] + n[2] * ways[w, 2])
             if along > any_best:
                 any_best, any_which = along, w
-            if facing > _FRONTAL and along > best:
+            if along > best and -(n[0] * ways[w, 0] + n[1] * ways[w, 1] + n[2] * ways[w, 2]) > _FRONTAL:
                 best, which = along, w
         cosine[s], index[s] = (best, which) if which >= 0 else (any_best, any_which)

@@ -103,14 +103,18 @@ class HashField(nn.Module):
         """Where to evaluate the field along rays: the sampler's places, ended behind the first opaque surface."""
         return self.sampler.visible(rays, self.density_net, jitter)
 
-    def rendered(self, rays: Rays) -> Rendering:
-        """What rays see, without gradients: `refield.field.render.render_rays` in one go."""
+    def rendered(self, rays: Rays, chunk: int) -> Rendering:
+        """What rays see, without gradients: `refield.field.render.render_rays`, ``chunk`` rays at once."""
         sampler, enc = self.sampler, self.encoding
         space = (sampler.contraction.centre, sampler.contraction.radius)
-        lines = (rays.origins, rays.directions, rays.origins.new_zeros(len(rays)))
-        field = (enc.tables, enc.resolutions, self.networks)
-        with torch.no_grad():
-            return Rendering(*kernels.render(lines, space, sampler.grid, sampler.lattice, field, STOP, sampler.fine))
+        field, parts = (enc.tables, enc.resolutions, self.networks), []
+        for i in range(0, max(len(rays), 1), chunk):
+            some = rays[i : i + chunk]
+            lines = (some.origins, some.directions, some.origins.new_zeros(len(some)))
+            with torch.no_grad():
+                seen = kernels.render(lines, space, sampler.grid, sampler.lattice, field, STOP, sampler.fine)
+            parts.append(Rendering(*seen))
+        return Rendering.joined(parts)
 
     @property
     def networks(self) -> Networks:

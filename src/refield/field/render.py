@@ -30,32 +30,34 @@ def render_rays(field: Field, rays: Rays, jitter: bool = False) -> Rendering:
 
 
 def render_many(field: Field, rays: Rays, chunk: int = CHUNK) -> Rendering:
-    """:func:`render_rays` without gradients, chunk by chunk. Rays that meet nothing of what a field changed in another
-    (``unchanged``) are that other's."""
+    """:func:`render_rays` without gradients, ``chunk`` rays at once; the field's own way (``rendered``) if it has one.
+    Rays that meet nothing of what a field changed in another (``unchanged``) are that other's."""
+    whole: Callable[[Rays, int], Rendering] | None = getattr(field, "rendered", None)
+    if whole is not None:
+        return whole(rays, chunk)
     with torch.no_grad():
-        parts = [_rendered(field, rays[i : i + chunk]) for i in range(0, max(len(rays), 1), chunk)]
-    return Rendering(
-        torch.cat([p.rgb for p in parts]),
-        torch.cat([p.depth for p in parts]),
-        torch.cat([p.opacity for p in parts]),
-    )
+        parts = [_rendered(field, rays[i : i + chunk], chunk) for i in range(0, max(len(rays), 1), chunk)]
+        return Rendering.joined(parts)
 
 
-def _rendered(field: Field, rays: Rays) -> Rendering:
+def _rendered(field: Field, rays: Rays, chunk: int) -> Rendering:
     """Of one chunk."""
     unchanged: Callable[[Rays], tuple[Field, Tensor]] | None = getattr(field, "unchanged", None)
     if unchanged is None:
-        whole: Callable[[Rays], Rendering] | None = getattr(field, "rendered", None)
-        return render_rays(field, rays) if whole is None else whole(rays)
-    before, same = unchanged(rays)
+        return render_rays(field, rays)
+    return parted(*unchanged(rays), rays, chunk, lambda rest: render_rays(field, rest))
+
+
+def parted(before: Field, same: Tensor, rays: Rays, chunk: int, otherwise: Callable[[Rays], Rendering]) -> Rendering:
+    """N rays, of which those in ``same`` (N,) bool see what they see in the field ``before``."""
     rows, rest = same.nonzero()[:, 0], (~same).nonzero()[:, 0]
     if len(rest) == 0:
-        return _rendered(before, rays)
+        return render_many(before, rays, chunk)
     if len(rows) == 0:
-        return render_rays(field, rays)
-    old, new = _rendered(before, rays[rows]), render_rays(field, rays[rest])
+        return otherwise(rays)
+    joined = Rendering.joined([render_many(before, rays[rows], chunk), otherwise(rays[rest])])
     order = torch.cat([rows, rest]).argsort()
-    return Rendering(*(torch.cat([getattr(p, k) for p in (old, new)])[order] for k in ("rgb", "depth", "opacity")))
+    return Rendering(joined.rgb[order], joined.depth[order], joined.opacity[order])
 
 
 def render_camera(field: Field, camera: Camera, world_from_cam: Tensor, chunk: int = CHUNK) -> Rendering:

@@ -11,6 +11,7 @@ from torch import Tensor
 from refield.field import kernels
 from refield.field.encoding import Contraction
 from refield.field.kernels.masks import marked, part_of
+from refield.field.kernels.onward import Span
 from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
@@ -49,6 +50,17 @@ class OccupancySampler:
         """As a call, but nothing behind the sample where the optical depth passes ``stop``."""
         with torch.no_grad():
             return Samples(*kernels.march_visible(*self._question(rays, jitter), net, stop, self.fine))
+
+    def onward(self, rays: Rays, span: Span, most: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The next samples of N rays, ``most`` of each: see `kernels.next_samples`."""
+        with torch.no_grad():
+            lines, space, grid, lattice = self._question(rays, False)
+            return kernels.next_samples(lines, space, grid, lattice, span, most, self.fine)
+
+    def first(self, rays: Rays, enter: Tensor, leave: Tensor) -> Tensor:
+        """Where the first sample of each of N rays begins, of those from ``enter`` to ``leave`` (N,), and perhaps some
+        beside them; (N,), infinite where there is none."""
+        return self.onward(rays, (torch.full_like(enter, self.near), enter, leave), 1)[0][:, 0]
 
     def _question(self, rays: Rays, jitter: bool) -> tuple[Rays3, Space, Tensor, Lattice]:
         n = len(rays)

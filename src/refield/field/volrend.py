@@ -6,6 +6,7 @@ ray i owns samples ``ray_offsets[i] : ray_offsets[i + 1]``, near to far.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,6 +70,11 @@ class Rendering:
 
     def reshape(self, *shape: int) -> Rendering:
         return Rendering(self.rgb.reshape(*shape, 3), self.depth.reshape(shape), self.opacity.reshape(shape))
+
+    @staticmethod
+    def joined(parts: Sequence[Rendering]) -> Rendering:
+        """Those of one set of rays after the other, one at least."""
+        return Rendering(*(torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "depth", "opacity")))
 
 
 def weights(sigmas: Tensor, samples: Samples) -> Tensor:

@@ -119,3 +119,9 @@ def crossing(rays: Rays, box: Tensor) -> tuple[Tensor, Tensor]:
     inverse = 1 / torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)
     a, b = (box[0] - rays.origins) * inverse, (box[1] - rays.origins) * inverse
     return torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)
+
+
+def leaving(rays: Rays, box: Tensor) -> Tensor:
+    """Distance at which each ray leaves a world box, (N,); 0 if it does not meet it."""
+    enter, leave = crossing(rays, box)
+    return torch.where(leave > enter, leave, 0.0)

@@ -54,6 +54,15 @@ def meet_grid(rays: Rays, aabb: Tensor, values: Tensor, level: float, tight: Ten
     return out
 
 
+def spans(rays: Rays, boxes: Tensor) -> tuple[Tensor, Tensor]:
+    """N rays, world boxes (B, 2, 3) -> distances (N,) at which each ray enters the first of them that it meets and
+    leaves the last, on the CPU; infinite and 0 where it meets none."""
+    enter, leave = torch.empty(len(rays)), torch.empty(len(rays))
+    origins, directions, sides = (t.detach().cpu().numpy() for t in (rays.origins, rays.directions, boxes.float()))
+    _spans(origins, directions, sides, enter.numpy(), leave.numpy())
+    return enter, leave
+
+
 def trilinear(x: Tensor, aabb: Tensor, values: Tensor) -> Tensor:
     """The value itself at points (..., 3), (...,); 0 outside. Differentiable in ``x``."""
     lo, hi = aabb.to(x.device, x.dtype)
@@ -106,6 +115,27 @@ def _above(values: _Array, aabb: _Array, level: float, x: float, y: float, z: fl
 def _in_grid(x: _Array, aabb: _Array, values: _Array, level: float, out: _Array) -> None:
     for s in prange(len(x)):
         out[s] = _above(values, aabb, level, x[s, 0], x[s, 1], x[s, 2])
+
+
+@njit(**_JIT)
+def _span(origin: _Array, direction: _Array, boxes: _Array) -> tuple[float, float]:
+    first, last = np.inf, 0.0
+    for k in range(len(boxes)):
+        near, far = 0.0, np.inf
+        for axis in range(3):
+            along = float(direction[axis])
+            along = along if abs(along) >= 1e-9 else 1e-9
+            a, b = (boxes[k, 0, axis] - origin[axis]) / along, (boxes[k, 1, axis] - origin[axis]) / along
+            near, far = max(near, min(a, b)), min(far, max(a, b))
+        if far > near:
+            first, last = min(first, near), max(last, far)
+    return first, last
+
+
+@njit(parallel=True, **_JIT)
+def _spans(origins: _Array, directions: _Array, boxes: _Array, enter: _Array, leave: _Array) -> None:
+    for n in prange(len(origins)):
+        enter[n], leave[n] = _span(origins[n], directions[n], boxes)
 
 
 @njit(parallel=True, **_JIT)

@@ -7,7 +7,7 @@ cut out: nothing is left inside them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,18 +19,19 @@ from torch.nn import functional
 from refield.field.nerfacto import NerfactoField
 from refield.field.outlook import Outlook
 from refield.field.radiance import Field, HashField
-from refield.field.render import visible_samples
+from refield.field.render import parted, visible_samples
 from refield.field.sampling import OccupancySampler
 from refield.field.source import Source
-from refield.field.volrend import Samples, interleaved
-from refield.field.warp import Move, crossing, inside_box, looked_up, moves_of, owners
+from refield.field.volrend import Rendering, Samples, interleaved
+from refield.field.warp import Move, inside_box, leaving, looked_up, moves_of, owners
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
-from refield.scene.inside import in_boxes
+from refield.scene.inside import in_boxes, spans
 from refield.scene.pose import rotate, transform
 from refield.update.light import Relighting
 from refield.update.region import Region, carved, finer, grown, move_out
 from refield.update.textured import TexturedPlane
+from refield.update.view import View, boxes_around, lights_of
 
 DILATION = 2.0
 """M_out is the object's grid, its box this many times as large (§10.1.3: 2 to 3)."""
@@ -145,9 +146,14 @@ class UpdatedField:
         if sampler is None:
             sampler = self._without_unseen(pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES))
         self.sampler = sampler
-        self._retold = _widened(self._told)
+        small = self._small_cells(pretrained.sampler)
+        earlier_small = pretrained._small if isinstance(pretrained, UpdatedField) else small
+        self._small: Tensor = small | earlier_small
+        self._said = _widened(self._own) | small
+        self._retold = _widened(self._told) | self._small
         before = pretrained._marched if isinstance(pretrained, UpdatedField) else ()
         self._split_of: tuple[Tensor, tuple[OccupancySampler, OccupancySampler]] | None = None
+        self._view_of: tuple[Tensor, View] | None = None
         self._changed_of: tuple[Tensor, tuple[OccupancySampler, tuple[Tensor, ...]]] | None = None
         self._marched: tuple[Tensor, ...] = tuple(_by_cells(self.sampler, b) for b in self.boxes) + before
 
@@ -216,17 +222,35 @@ class UpdatedField:
         grid.view(-1)[self.unseen] = 1 - self._told.view(-1)[self.unseen]
         return replace(self.sampler, grid=grid, fine=None)
 
+    @property
+    def rendered(self) -> Callable[[Rays, int], Rendering] | None:
+        """Shows N rays, without gradients, so many at once; None if the field of the first visit is no hash field."""
+        view = self._view
+        if view is None or not isinstance(self.pretrained, UpdatedField):
+            return None if view is None else view.rendered
+        return lambda rays, chunk: parted(*self.unchanged(rays), rays, chunk, lambda rest: view.rendered(rest, chunk))
+
+    @property
+    def _view(self) -> View | None:
+        if not isinstance(self._base, HashField) or not self._marched:
+            return None
+        if self._view_of is None or self._view_of[0] is not self.sampler.grid:
+            known, told = self._split
+            gone = ((self._base.sampler.grid > 0) & (known.grid == 0)).to(torch.uint8)
+            lights = [layer.light for layer in layers_of(self) if layer.light is not None]
+            view = View(self._base, gone, told, boxes_around(told, self._marched), lights_of(lights[::-1]), self)
+            self._view_of = self.sampler.grid, view
+        return self._view_of[1]
+
     def unchanged(self, rays: Rays) -> tuple[Field, Tensor]:
         """The field before, and which of N rays show what it shows, (N,) bool: they meet no cell in which this visit
         says anything, be it that nothing is there or that the light is another."""
         cells, boxes = self._changed
         same = torch.ones(len(rays), dtype=torch.bool, device=rays.origins.device)
         if boxes:
-            exits = torch.stack([leaving(rays, box) for box in boxes]).amax(0)
-            near = (exits > 0).nonzero()[:, 0]
-            if len(near):
-                far = float(exits.max()) / cells.contraction.radius
-                same[near] = replace(cells, far=min(far, cells.far))(rays[near]).ray_offsets.diff() == 0
+            enter, leave = spans(rays, torch.stack(boxes))
+            near = (leave > 0).nonzero()[:, 0]
+            same[near] = cells.first(rays[near], enter[near], leave[near]).isinf()
         return self.pretrained, same
 
     @property
@@ -234,7 +258,7 @@ class UpdatedField:
         """Looks into the cells in which this visit says anything; and world boxes (2, 3) that hold them all. Kept,
         since marching remembers a grid."""
         if self._changed_of is None or self._changed_of[0] is not self.sampler.grid:
-            grid = _widened(self._own) | (self.sampler.grid != self.pretrained.sampler.grid).to(torch.uint8)
+            grid = self._said | (self.sampler.grid != self.pretrained.sampler.grid).to(torch.uint8)
             boxes = list(self.boxes)
             if self.light is not None:
                 grid |= self.light.cells(self.sampler)
@@ -282,6 +306,16 @@ class UpdatedField:
             if self.earlier.ground is not None:
                 empty.append(cells[to.ground[~self.earlier.ground.sampler.occupied(x[to.ground])]])
         return grid, torch.cat(empty).unique()
+
+    def _small_cells(self, sampler: OccupancySampler) -> Tensor:
+        """(R, R, R) uint8: cells that hold some of what this visit says, be it so small that their centres lie beside
+        it."""
+        x = [transform(move.new_from_old, move.grid.occupied()) for move in self._shells]
+        x += [grid.occupied() for grid in (*self.region.grids, *self.earlier.places.grids)]
+        x += [plane.nodes[plane.known.reshape(-1)] for plane in self.region.planes]
+        grid = torch.zeros_like(sampler.grid)
+        grid.view(-1)[sampler.cells(torch.cat(x)) if x else []] = 1
+        return grid
 
     def density(self, x: Tensor) -> Tensor:
         """World points (..., 3) -> sigma (...,), per world unit."""
@@ -519,9 +553,3 @@ def _by_cells(sampler: OccupancySampler, box: Tensor) -> Tensor:
     """A world box (2, 3) grown by two and a half of the sampler's cells."""
     margin = 2.5 * float(sampler.width(sampler.contraction.reach(box)).max())
     return torch.stack([box[0] - margin, box[1] + margin])
-
-
-def leaving(rays: Rays, box: Tensor) -> Tensor:
-    """Distance at which each ray leaves a world box, (N,); 0 if it does not meet it."""
-    enter, leave = crossing(rays, box)
-    return torch.where(leave > enter, leave, 0.0)

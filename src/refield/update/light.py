@@ -59,6 +59,18 @@ class Relighting:
         out.view(-1)[cells[inside]] |= reach[i, j, k].to(out.dtype)
         return out
 
+    def cropped(self) -> Relighting | None:
+        """The same without most of what has no effect; None if nothing has any."""
+        lit = (self.log_gain != 0).any(-1).nonzero()
+        if len(lit) == 0:
+            return None
+        size = torch.tensor(self.log_gain.shape[:3])
+        first, last = (lit.amin(0) - 1).clamp_min(0), (lit.amax(0) + 1).minimum(size - 1)
+        spacing = (self.aabb[1] - self.aabb[0]).double() / (size - 1)
+        box = self.aabb[0].double() + torch.stack([first, last]) * spacing
+        (i, j, k), (l, m, n) = first.tolist(), (last + 1).tolist()
+        return Relighting(box.float(), self.log_gain[i:l, j:m, k:n].contiguous())
+
     def applied(self, x: Tensor, rgb: Tensor) -> Tensor:
         """World points (S, 3), colours (S, 3) -> colours in the new light (S, 3) in [0, 1]."""
         if x.device.type == "cpu" and not (torch.is_grad_enabled() and (x.requires_grad or rgb.requires_grad)):

@@ -11,7 +11,8 @@ from types import ModuleType
 
 from torch import Tensor
 
-from refield.field.kernels import reference
+from refield.field.kernels import onward, reference
+from refield.field.kernels.onward import Lights, Shown, Span, Way
 from refield.field.kernels.reference import (
     Aim,
     Batch,
@@ -36,6 +37,12 @@ def _twin(t: Tensor) -> ModuleType:
     from refield.field.kernels import cpu
 
     return cpu
+
+
+def _further(t: Tensor) -> ModuleType:
+    """The same, of what is in `onward`."""
+    twin = _twin(t)
+    return onward if twin is reference else twin
 
 
 def contract(x: Tensor, centre: Tensor, radius: float) -> Tensor:
@@ -111,6 +118,53 @@ def render(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.render`."""
     return _twin(grid).render(rays, space, grid, lattice, field, stop, fine)
+
+
+def next_samples(
+    rays: Rays3, space: Space, grid: Tensor, lattice: Lattice, span: Span, most: int, fine: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `onward.next_samples`."""
+    return _further(grid).next_samples(rays, space, grid, lattice, span, most, fine)
+
+
+def render_until(
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    stop: float,
+    fine: Tensor | None,
+    way: Way,
+    lights: Lights,
+) -> Tensor:
+    """See `onward.render_until`."""
+    return _further(grid).render_until(rays, space, grid, lattice, field, stop, fine, way, lights)
+
+
+def shown_on(
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    field: tuple[Tensor, tuple[int, ...], Networks],
+    stop: float,
+    fine: Tensor | None,
+    way: Way,
+    lights: Lights,
+) -> Shown:
+    """See `onward.shown_on`."""
+    return _further(grid).shown_on(rays, space, grid, lattice, field, stop, fine, way, lights)
+
+
+def blend(sums: Tensor, a: Shown, b: Shown) -> Tensor:
+    """See `onward.blend`."""
+    return _further(sums).blend(sums, a, b)
+
+
+def relight(x: Tensor, rgb: Tensor, lights: Lights) -> Tensor:
+    """See `onward.relight`."""
+    return _further(x).relight(x, rgb, lights)
 
 
 def adam(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, step: int) -> None:

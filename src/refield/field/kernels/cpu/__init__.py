@@ -6,8 +6,10 @@ sums are over a fixed number of groups: results are the same, bit for bit, for e
 
 from refield.field.kernels.cpu.cells import narrow, note
 from refield.field.kernels.cpu.encoding import hash_encode
+from refield.field.kernels.cpu.lights import relight
 from refield.field.kernels.cpu.marching import hash_density, march, march_visible
 from refield.field.kernels.cpu.networks import hash_field
+from refield.field.kernels.cpu.onward import blend, next_samples, render_until, shown_on
 from refield.field.kernels.cpu.optimiser import adam, keep, observe, scatter_max
 from refield.field.kernels.cpu.rays import accumulate, contract, distortion, spherical_harmonics, weights
 from refield.field.kernels.cpu.rendering import render
@@ -17,6 +19,7 @@ from refield.field.kernels.cpu.woven import woven_step
 __all__ = [
     "accumulate",
     "adam",
+    "blend",
     "contract",
     "distortion",
     "hash_density",
@@ -26,10 +29,14 @@ __all__ = [
     "march",
     "march_visible",
     "narrow",
+    "next_samples",
     "note",
     "observe",
+    "relight",
     "render",
+    "render_until",
     "scatter_max",
+    "shown_on",
     "spherical_harmonics",
     "train_step",
     "weights",

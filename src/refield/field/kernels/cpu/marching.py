@@ -6,7 +6,6 @@ network see hundreds of samples at once, and a ray stops after the wave in which
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,108 +13,18 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-from refield.field.kernels.cpu.cells import BLOCKS, grids_of
+from refield.field.kernels.cpu.cells import grids_of
 from refield.field.kernels.cpu.encoding import array, encode_part, pairs, parts_of, scratch
 from refield.field.kernels.cpu.networks import padded
 from refield.field.kernels.cpu.simd import JIT, exp, product
+from refield.field.kernels.cpu.walk import next_sample, start
+from refield.field.kernels.onward import Way
 from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 
-_ZERO, _ONE, _TWO, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
+_ZERO = np.float32(0)
 _BLOCK = 128  # samples whose hidden layer is held at once
-_FINE = np.float32(4)  # sub-cells a side of a cell
-_BLOCK_FINE = 4 * BLOCKS  # sub-cells a side of a block that is skipped
+_NO_WAY = (*(np.zeros(0, np.float32) for _ in range(3)), np.zeros((0, 0, 0), np.uint8))
 _ROOM = 32  # samples a ray that are made room for at first
-
-
-@njit(forceinline=True, **JIT)
-def _leave(p, inverse, size, many):  # type: ignore[no-untyped-def]
-    """Distance until the coordinate p, in cells, leaves ``many`` cubes of ``size`` cells; inverse: per cell of p."""
-    cube = np.float32(math.floor(p / size))  # a power of two: exact
-    edge = size * (cube + many) if inverse > 0 else size * (cube + _ONE - many)
-    return (edge - p) * inverse
-
-
-@njit(forceinline=True, **JIT)
-def _next(ray, t, far, step, grids, unit):  # type: ignore[no-untyped-def]
-    """The first lattice interval at or after t whose midpoint lies where something may be: (t, dt); dt = 0 if none.
-
-    ``ray``: see :func:`_start`; ``grids``: see `cells.grids_of`. ``unit`` (3,) is set to the midpoint in [0, 1].
-    """
-    grid, reaches, fine = grids
-    r = grid.shape[0]
-    last = 4 * r - 1
-    per_unit, quarter, half = np.float32(r / 4), np.float32(0.25), step * _HALF
-    u0, u1, u2, v0, v1, v2 = ray[0], ray[1], ray[2], ray[3], ray[4], ray[5]
-    while t < far:
-        x, y, z = u0 + v0 * t, u1 + v1 * t, u2 + v2 * t
-        m = max(abs(x), max(abs(y), abs(z)))
-        if m <= _ONE:
-            dt = step
-            x, y, z = x + v0 * half, y + v1 * half, z + v2 * half
-        else:
-            dt = step * m * np.float32(math.sqrt(m))
-            x, y, z = x + v0 * dt * _HALF, y + v1 * dt * _HALF, z + v2 * dt * _HALF
-        m = max(abs(x), max(abs(y), abs(z)))
-        if m > _ONE:
-            k = (_TWO - _ONE / m) / m
-            x, y, z = x * k, y * k, z * k
-        a, b, c = x + _TWO, y + _TWO, z + _TWO
-        p, q, o = a * per_unit, b * per_unit, c * per_unit
-        i, j, l = (
-            min(max(int(p * _FINE), 0), last),
-            min(max(int(q * _FINE), 0), last),
-            min(max(int(o * _FINE), 0), last),
-        )
-        empty = reaches[i // _BLOCK_FINE, j // _BLOCK_FINE, l // _BLOCK_FINE]
-        size, many = (np.float32(BLOCKS), np.float32(empty)) if empty > 0 else (_ONE, _ONE)
-        if empty == 0 and grid[i >> 2, j >> 2, l >> 2] > 0:
-            mask = fine[i >> 2, j >> 2, l >> 2] if len(fine) > 0 else 0
-            if mask == 0 or (mask >> (((i & 3) * 4 + (j & 3)) * 4 + (l & 3))) & 1:
-                unit[0], unit[1], unit[2] = a * quarter, b * quarter, c * quarter
-                return t, dt
-            size = quarter
-        if m < _ONE:
-            # lattice midpoints in what is empty are skipped; a hair is kept back for rounding
-            leave = min(
-                min(_leave(p, ray[6], size, many), _leave(q, ray[7], size, many)),
-                min(_leave(o, ray[8], size, many), (_ONE - m) * ray[9]),
-            )
-            skip = np.float32(math.floor(leave * ray[10] - np.float32(1e-3)))
-            if skip > 0:
-                t += step * skip
-        elif empty > 1:
-            # outside the core the lattice has to be walked, but without a look at the grid; the contraction lengthens
-            # nothing by more than 4/3
-            safe = min(t + np.float32(empty - 1) * np.float32(0.75 * BLOCKS) / per_unit * ray[9], far)
-            t += dt
-            while t < safe:
-                m = max(abs(u0 + v0 * t), max(abs(u1 + v1 * t), abs(u2 + v2 * t)))
-                dt = step if m <= _ONE else step * m * np.float32(math.sqrt(m))
-                if t + dt >= safe:
-                    break
-                t += dt
-            continue
-        t += dt
-    return t, _ZERO
-
-
-@njit(forceinline=True, **JIT)
-def _start(rays, space, lattice, per_unit, r, ray):  # type: ignore[no-untyped-def]
-    """Ray r in core radii into ``ray`` (11,); returns its first t.
-
-    Origin (3), direction (3), its inverse in cells (3), the inverse of its fastest component, and of the step.
-    """
-    origins, directions, jitter = rays
-    fastest = np.float32(1e-9)
-    for a in range(3):
-        ray[a] = (origins[r, a] - space[0][a]) / space[1]
-        v = directions[r, a] / space[1]
-        ray[3 + a] = v
-        speed = v * per_unit
-        ray[6 + a] = _ONE / speed if abs(speed) > np.float32(1e-9) else np.float32(1e9)
-        fastest = max(fastest, abs(v))
-    ray[9], ray[10] = _ONE / fastest, _ONE / np.float32(lattice[2])
-    return np.float32(lattice[0]) + jitter[r] * np.float32(lattice[2])
 
 
 @njit(**JIT)
@@ -123,10 +32,10 @@ def _march_part(begin, end, rays, space, grids, lattice, t0, t1, counts):  # typ
     far, step = np.float32(lattice[1]), np.float32(lattice[2])
     ray, unit = np.empty(11, np.float32), np.empty(3, np.float32)
     for r in range(begin, end):
-        t = _start(rays, space, lattice, np.float32(grids[0].shape[0] / 4), r, ray)
+        t = start(rays, space, lattice, np.float32(grids[0].shape[0] / 4), r, ray)
         found = 0
         while True:
-            t, dt = _next(ray, t, far, step, grids, unit)
+            t, dt = next_sample(ray, t, far, step, grids, unit)
             if dt == 0:
                 break
             if found < t0.shape[1]:
@@ -204,19 +113,33 @@ def _raw_density(features, first, n, sizes, w_in, w_out, x, hidden, raw):  # typ
         raw[s] = total
 
 
+@njit(forceinline=True, **JIT)
+def _inside(unit, grid):  # type: ignore[no-untyped-def]
+    r = grid.shape[0]
+    i, j, k = int(unit[0] * r), int(unit[1] * r), int(unit[2] * r)
+    return grid[min(max(i, 0), r - 1), min(max(j, 0), r - 1), min(max(k, 0), r - 1)] > 0
+
+
 @njit(**JIT)
-def _wave_part(begin, end, rays, space, grids, lattice, net, arena):  # type: ignore[no-untyped-def]
-    """March rays ``begin : end``; the samples, wave by wave, into ``arena``. Returns how many, or -1 without room."""
+def _wave_part(begin, end, rays, space, grids, lattice, net, way, arena):  # type: ignore[no-untyped-def]
+    """March rays ``begin : end``; the samples, wave by wave, into ``arena``. Returns how many, or -1 without room.
+
+    ``way`` is what `onward.Way` says, or empty arrays; where rays came to is written over its ``t`` and ``depth``.
+    """
     tables, resolutions, w_in, w_out, stop = net
     t0, t1, owner, unit, features = arena
-    n, far, step = end - begin, np.float32(lattice[1]), np.float32(lattice[2])
+    under_way, until, depth, gone = way
+    n, step = end - begin, np.float32(lattice[2])
     lines, t, tau = np.empty((n, 11), np.float32), np.empty(n, np.float32), np.zeros(n, np.float32)
+    far = np.full(n, np.float32(lattice[1]))
     alive = np.arange(n)
     x, hidden = np.zeros((_BLOCK, features.shape[1]), np.float32), np.empty((_BLOCK, w_in.shape[1]), np.float32)
     raw = np.empty(_BLOCK, np.float32)
     pair_features = features.view(np.float64)
     for r in range(n):
-        t[r] = _start(rays, space, lattice, np.float32(grids[0].shape[0] / 4), begin + r, lines[r])
+        t[r] = start(rays, space, lattice, np.float32(grids[0].shape[0] / 4), begin + r, lines[r])
+        if len(under_way) > 0:
+            t[r], tau[r], far[r] = under_way[begin + r], depth[begin + r], min(far[r], until[begin + r])
     total, living = 0, n
     while living > 0:
         if total + living > len(t0):
@@ -224,7 +147,9 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, arena):  # type: ig
         m = 0
         for a in range(living):
             r = alive[a]
-            t[r], dt = _next(lines[r], t[r], far, step, grids, unit[total + m])
+            t[r], dt = next_sample(lines[r], t[r], far[r], step, grids, unit[total + m])
+            while dt > 0 and len(gone) > 0 and _inside(unit[total + m], gone):
+                t[r], dt = next_sample(lines[r], t[r] + dt, far[r], step, grids, unit[total + m])
             if dt > 0:
                 t0[total + m], t1[total + m], owner[total + m] = t[r], t[r] + dt, begin + r
                 t[r] += dt
@@ -242,16 +167,18 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, arena):  # type: ig
                     alive[living] = r
                     living += 1
         total += m
+    if len(under_way) > 0:
+        under_way[begin:end], depth[begin:end] = t, tau
     return total
 
 
 @njit(parallel=True, **JIT)
-def _waves(rays, space, grids, lattice, net, arena, found):  # type: ignore[no-untyped-def]
+def _waves(rays, space, grids, lattice, net, way, arena, found):  # type: ignore[no-untyped-def]
     n, parts = rays[0].shape[0], len(found)
     t0, t1, owner, unit, features = arena
     for p in prange(parts):
         mine = (t0[p], t1[p], owner[p], unit[p], features[p])
-        found[p] = _wave_part(n * p // parts, n * (p + 1) // parts, rays, space, grids, lattice, net, mine)
+        found[p] = _wave_part(n * p // parts, n * (p + 1) // parts, rays, space, grids, lattice, net, way, mine)
 
 
 @njit(parallel=True, **JIT)
@@ -345,8 +272,9 @@ def marched(
     net: DensityNet,
     stop: float,
     fine: Tensor | None = None,
+    way: Way | None = None,
 ) -> Marched:
-    """The waves, packed."""
+    """The waves, packed. Where rays came to is written over the ``t`` and ``depth`` of a ``way``."""
     arrays, place = _arrays(rays, space)
     inside = (*_network(net), float(stop))
     width = inside[2].shape[0]
@@ -357,12 +285,16 @@ def marched(
     grids = grids_of(grid, fine)
     while True:
         arena = _room("waves", parts, room, width)
-        _waves(arrays, place, grids, lattice, inside, arena, found)
+        on = _NO_WAY if way is None else (*(array(a).copy() for a in way[:3]), array(way.gone))
+        _waves(arrays, place, grids, lattice, inside, on, arena, found)
         if found.min() >= 0:
             break
         room *= 4
     counts = np.zeros(n, np.int64)
     _count(arena[2], found, counts)
+    if way is not None:
+        way.t.copy_(torch.from_numpy(on[0]))
+        way.depth.copy_(torch.from_numpy(on[2]))
     offsets = _offsets(counts)
     t0, t1, owners, unit, features = (page[0] for page in _room("sorted", 1, int(offsets[-1]), width))
     _sort(arena, found, offsets[:-1].copy(), (t0, t1, owners, unit, features))

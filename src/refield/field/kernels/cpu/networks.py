@@ -184,7 +184,8 @@ def _forward_part(begin, end, features, directions, sizes, packed, raw, rgb):  #
 
 
 @njit(parallel=True, **JIT)
-def _forward(features, directions, sizes, packed, raw, rgb):  # type: ignore[no-untyped-def]
+def forward_all(features, directions, sizes, packed, raw, rgb):  # type: ignore[no-untyped-def]
+    """Features (S, F) and directions (S, 3) -> raw densities (S,) and colours (S, 3)."""
     n = len(raw)
     for g in prange(_GROUPS):
         _forward_part(n * g // _GROUPS, n * (g + 1) // _GROUPS, features, directions, sizes, packed, raw, rgb)
@@ -226,7 +227,7 @@ class _HashField(Function):
         features = np.empty((len(unit), 2 * len(res)), np.float32)
         encode(array(unit), pairs(tables), res, features.view(np.float64), parts_of(len(unit)))
         raw, rgb = torch.empty(len(unit)), torch.empty(len(unit), 3)
-        _forward(features, array(d), sizes_of(networks), pack(networks), raw.numpy(), rgb.numpy())
+        forward_all(features, array(d), sizes_of(networks), pack(networks), raw.numpy(), rgb.numpy())
         ctx.save_for_backward(unit, d, tables, *networks)
         ctx.features, ctx.resolutions = features, res
         return raw, rgb

@@ -20,6 +20,13 @@ from refield.field.kernels.gpu.optimiser import adam, adam_scale, descend, obser
 from refield.field.kernels.gpu.rays import accumulate, contract, distortion, ray_ids, spherical_harmonics, weights
 from refield.field.kernels.gpu.rendering import render
 from refield.field.kernels.gpu.step import train_step
+from refield.field.kernels.onward import (  # torch's own kernels do for these, too
+    blend,
+    next_samples,
+    relight,
+    render_until,
+    shown_on,
+)
 from refield.field.kernels.reference import (  # torch's own kernels do for those; nobody trains a helper on a GPU yet
     keep,
     narrow,
@@ -31,6 +38,7 @@ __all__ = [
     "accumulate",
     "adam",
     "adam_scale",
+    "blend",
     "contract",
     "descend",
     "distortion",
@@ -41,11 +49,15 @@ __all__ = [
     "march",
     "march_visible",
     "narrow",
+    "next_samples",
     "note",
     "observe",
     "ray_ids",
+    "relight",
     "render",
+    "render_until",
     "scatter_max",
+    "shown_on",
     "spherical_harmonics",
     "train_step",
     "weights",
