@@ -7,15 +7,19 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
 from refield.cli import COMMANDS, main
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
+from refield.scene.exposure import Exposure
 from refield.scene.images import read_image, write_image
+from refield.scene.refined import write_refined
 from refield.workspace import Workspace
 from tests.conftest import HERE, TINY_FIT
 from tests.folders import contents
@@ -72,6 +76,22 @@ def test_render_writes_one_picture_per_frame(place, capsys):
     assert sorted(p.name for p in (place / "pictures").iterdir()) == [f"00{i}.png" for i in range(4)]
     assert read_image(place / "pictures/000.png").shape == (24, 32, 3)
     assert "4 pictures in pictures" in capsys.readouterr().out
+
+
+def test_render_gives_pictures_the_look_of_a_photo(place, capsys):
+    workspace = Workspace.open(place / "work")
+    given = workspace.given_capture()
+    dark = replace(given.frames[0], exposure=Exposure((0.5, 0.5, 0.25)))
+    write_refined(place / "work/capture/refined.json", given, replace(given, frames=(dark, *given.frames[1:])))
+    argv = ["render", "work", "--cameras", "new/transforms.json", "--out"]
+    looks = {"neutral": [], "dark": ["--look", dark.name], "other": ["--look", Path(given.frames[1].name).stem]}
+    for out, look in looks.items():
+        assert main([*argv, out, *look]) == 0
+    neutral, darkened, other = (read_image(place / out / "001.png").astype(float) for out in looks)
+    assert np.abs(darkened - neutral * [0.5, 0.5, 0.25]).max() <= 1 and neutral.max() > 20
+    assert np.array_equal(other, neutral)
+    assert main([*argv, "none", "--look", "nowhere.jpg"]) == 2
+    assert "nowhere.jpg" in capsys.readouterr().err
 
 
 def test_evaluate_writes_numbers(place, capsys):

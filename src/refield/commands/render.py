@@ -1,4 +1,4 @@
-"""``refield render WORK --cameras FILE --out DIR [--visit N]``: pictures of the scene as it was or is."""
+"""``refield render WORK --cameras FILE --out DIR [--visit N] [--look PHOTO]``: pictures of it as it was or is."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from refield.field.render import render_frame
 from refield.history import state
 from refield.scene.capture import Frame
 from refield.scene.errors import InputError
+from refield.scene.exposure import Exposure
 from refield.scene.images import is_ours, write_image
 from refield.scene.left_out import named
 from refield.scene.transforms_json import load_cameras, stem
@@ -33,6 +34,9 @@ class Render:
     """the folder for the pictures"""
     visit: int | None = None
     """the state to show: 0 is before any visit; the latest by default"""
+    look: str | None = None
+    """a photo of the workspace's capture whose exposure, white balance and vignetting the pictures have; by default the
+    photos' mean exposure, and no vignetting"""
     overwrite: bool = False
     """replace pictures in ``out`` that refield did not write"""
 
@@ -42,17 +46,36 @@ def run(options: Render) -> None:
     workspace = Workspace.open(options.work)
     visit = workspace.chosen_visit(options.visit)
     frames = load_cameras(options.cameras, warn=clock.warn)
+    exposure = None if options.look is None else exposure_of(workspace, options.look)
     paths = output_paths(options.cameras, frames, options.out, overwrite=options.overwrite)
     clock.stage(f"load the field as of visit {visit}")
-    render(state(workspace, visit), frames, paths, clock)
+    render(state(workspace, visit), frames, paths, clock, exposure)
     print(f"{len(paths)} pictures in {options.out}")
 
 
-def render(field: Field, frames: list[Frame], paths: list[Path], clock: Clock) -> None:
-    """Write one picture per frame."""
+def exposure_of(workspace: Workspace, photo: str) -> Exposure:
+    """How a photo of the workspace's capture, named by its file or by that without its ending, was exposed.
+
+    Raises:
+        InputError: there is no such photo.
+    """
+    frames = workspace.capture().frames
+    for frame in frames:
+        if photo in (frame.name, Path(frame.name).name, stem(frame)):
+            return frame.exposure or Exposure()
+    where = workspace.path / "capture" / "transforms.json"
+    raise InputError(where, f"names no photo {photo!r}", f"give one of its photos, such as {frames[0].name}")
+
+
+def render(
+    field: Field, frames: list[Frame], paths: list[Path], clock: Clock, exposure: Exposure | None = None
+) -> None:
+    """Write one picture per frame, neutral or as a photo of that exposure."""
     clock.stage(f"render {len(frames)} views")
     for frame, path in zip(frames, paths):
         picture = render_frame(field, frame).rgb
+        if exposure is not None:
+            picture = exposure.taken(picture, frame.camera)
         with writable(path):
             write_image(path, picture)
     clock.stop()
