@@ -132,8 +132,7 @@ def train(
         clock.stage("keep the field")
         workspace.keep_field(fitted, line.psnr)
         workspace.keep_refined(capture, found)
-        if said := in_words(capture, found):
-            clock.console.print(f"           of the photos: {said}", markup=False)
+        _tell_found(capture, found, clock)
     clock.stop()
     return line.psnr
 
@@ -169,6 +168,7 @@ def train_more(work: Path, clock: Clock, config: FitConfig, quality: Quality) ->
                 write_landmarks(renewed.landmarks, landmarks)
             renewed.keep_field(done.field, line.psnr)
             renewed.keep_refined(given, done.capture)
+        _tell_found(capture, done.capture, clock)
     clock.stop()
     return max(line.psnr, before) if math.isfinite(before) else line.psnr
 
@@ -182,6 +182,11 @@ def _tell(capture: Capture, config: FitConfig | NerfactoFitConfig, needed: Memor
     for line in told:
         if line:
             clock.console.print(f"           {line}", markup=False)
+
+
+def _tell_found(given: Capture, found: Capture, clock: Clock) -> None:
+    if said := in_words(given, found):
+        clock.console.print(f"           of the photos: {said}", markup=False)
 
 
 def _fitted(

@@ -22,10 +22,10 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame
 from refield.scene.exposure import Exposure
 
-_EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.1, 0.25, 0.1  # of a fit: what is asked of it must be there first
+_EXPOSED_FROM, _POSED_FROM, _TRUSTED_FROM = 0.15, 0.25, 0.1  # of a fit: what is asked of it must be there first
 # So far into a fit that finds exposures, colours do not depend on where they are seen from: each photo has directions
 # of its own, by which a field would learn its exposure. Longer costs it gloss that it then has no time to learn.
-_PLAIN = 0.2
+_PLAIN = 0.25
 _PLACES = 16  # where rays end, a side of the contracted cube
 _MOVING = 4  # every so-many-th ray tells how poses are wrong
 

@@ -63,7 +63,9 @@ class Photos:
         return HeldOut(self.held_out, masks=self.judged)
 
 
-_CLEARLY = 0.5  # dB: what exposures that were taken for others than they are may cost
+# dB. Left-out photos of four real scenes, as they are, gained -0.24 to 0.17 in eight fits, and 0.57 to 0.98 in four fits
+# of one with half a stop put on at random
+_CLEARLY = 0.35
 
 
 class HeldOut:
