@@ -14,7 +14,7 @@ import torch
 
 from benchmarks.record import Report, Row, forget_peaks, median, one_line, peak_memory
 from refield.field import fit_nerfacto, gpu_fit, graphed
-from refield.field.coverage import knowable
+from refield.field.coverage import beside, knowable
 from refield.field.fit import FitConfig, FitProgress
 from refield.field.fit_nerfacto import NerfactoFitConfig
 from refield.field.gpu_fit import move
@@ -82,8 +82,8 @@ def fit(model: HashField, capture: Capture, config: FitConfig, device: torch.dev
         usual = gpu_fit._SIZES, gpu_fit.EVERY
         gpu_fit._SIZES, gpu_fit.EVERY = [8], 4
         try:
-            extra = knowable(model.sampler, capture.train), looks.append, None
-            gpu_fit._GpuFit(model, Photos.of(capture), config, extra).run()
+            known = knowable(model.sampler, capture.train), beside(model.sampler, capture.train)
+            gpu_fit._GpuFit(model, Photos.of(capture), config, (known, True), (looks.append, None)).run()
         finally:
             gpu_fit._SIZES, gpu_fit.EVERY = usual
 

@@ -13,6 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from refield.field import fit
+from refield.field.coverage import beside
 from refield.field.descent import FADE_EVERY, TableAdam, fading
 from refield.field.encoding import Contraction
 from refield.field.fit import FitConfig, fit_field
@@ -65,6 +66,14 @@ def test_walls_around_the_cameras_are_taken_into_the_core() -> None:
 def test_cameras_in_a_larger_core_do_not_stand_around_it() -> None:
     ring = looking(1.67)
     assert stand_outside(CORE, ring) and not stand_outside(replace(CORE, radius=2.0), ring)
+
+
+def test_cells_right_beside_a_camera_are_told_from_others() -> None:
+    sampler, ring = Shell(1.0).sampler, looking(1.67)
+    cells = beside(sampler, ring)
+    x = sampler.points_in(torch.arange(sampler.grid.numel()), jitter=False)
+    away = torch.cdist(x, torch.stack([f.centre.float() for f in ring])).amin(-1)
+    assert cells.any() and away[cells].max() < 1.0 and not cells[x.norm(dim=-1) < 0.9].any()
 
 
 def test_a_fit_looks_around_where_it_is_asked_to(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

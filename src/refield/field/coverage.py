@@ -9,7 +9,7 @@ from torch.nn import functional
 from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Frame
 
-_NEAR = 0.8  # core radii
+_NEAR, _BESIDE = 0.8, 0.5  # core radii
 _PART, _LEAST, _ENOUGH = 0.1, 3, 6  # of the cameras; between these numbers of them
 _COARSE = 2  # cells of the occupancy grid, along each axis, that are decided together
 
@@ -48,3 +48,14 @@ def knowable(sampler: OccupancySampler, frames: tuple[Frame, ...]) -> Tensor:
     needed = torch.where(near > 0, enough, torch.where(ahead > 0, few, 0))
     allowed = (seen >= needed).reshape(1, 1, r, r, r).float()
     return functional.interpolate(allowed, scale_factor=_COARSE, mode="nearest").reshape(-1) > 0
+
+
+def beside(sampler: OccupancySampler, frames: tuple[Frame, ...]) -> Tensor:
+    """(R**3,) bool: cells right beside a camera, where hardly anything is that it looks at."""
+    r = sampler.resolution // _COARSE
+    coarse = OccupancySampler(sampler.contraction, torch.zeros(r, r, r, dtype=torch.uint8), sampler.step)
+    x = coarse.points_in(torch.arange(r**3), jitter=False)
+    eyes = torch.stack([f.centre.float() for f in frames])
+    near = torch.cat([torch.cdist(some, eyes).amin(-1) for some in x.split(1 << 16)])
+    found = (near < _BESIDE * sampler.contraction.radius).float().reshape(1, 1, r, r, r)
+    return functional.interpolate(found, scale_factor=_COARSE, mode="nearest").reshape(-1) > 0

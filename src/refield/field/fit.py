@@ -12,7 +12,7 @@ import torch
 
 from refield.field import kernels
 from refield.field.compiling import Compiling, compiling
-from refield.field.coverage import knowable
+from refield.field.coverage import beside, knowable
 from refield.field.descent import NonFiniteError, TableAdam
 from refield.field.encoding import Contraction
 from refield.field.kernels.reference import Aim
@@ -245,7 +245,8 @@ class _Fit:
         self.adam = TableAdam(model, config.decay or 0.0)
         self.plain = not self.adam.parameters[COLOUR_IN][:, -DIRECTED:].any()
         allowed, outside = knowable(model.sampler, photos.train), stand_outside(model.contraction, photos.train)
-        self.occupancy = OccupancyTrainer(model, allowed=allowed, outside=outside)
+        near = beside(model.sampler, photos.train) if outside else None
+        self.occupancy = OccupancyTrainer(model, allowed=allowed, outside=outside, beside=near)
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
         self.samples_per_ray = config.samples / 512

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from refield.field.coverage import knowable
+from refield.field.coverage import beside, knowable
 from refield.field.descent import FADE_EVERY, MOST_SKIPPED, NonFiniteError, fading
 from refield.field.encoding import Contraction
 from refield.field.fit import (
@@ -50,11 +50,12 @@ def fit_on_gpu(
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row.
     """
     home, device = model.encoding.tables.device, torch.device("cuda", torch.cuda.current_device())
-    allowed = knowable(model.sampler, photos.train)
+    known = knowable(model.sampler, photos.train).to(device), beside(model.sampler, photos.train).to(device)
+    outside = stand_outside(model.contraction, photos.train)
     move(model, device)
     try:
         with torch.device(device):  # what is made in here without a device named is made on the GPU
-            _GpuFit(model, photos, config, (allowed.to(device), on_progress, on_step)).run()
+            _GpuFit(model, photos, config, (known, outside), (on_progress, on_step)).run()
     finally:
         move(model, home)
 
@@ -76,20 +77,22 @@ class _GpuFit:
         model: HashField,
         photos: Photos,
         config: FitConfig,
-        extra: tuple[torch.Tensor, ProgressCallback | None, StepCallback | None],
+        places: tuple[tuple[torch.Tensor, torch.Tensor], bool],
+        told: tuple[ProgressCallback | None, StepCallback | None],
     ) -> None:
-        allowed, self.on_progress, self.on_step = extra
+        """``places``: cells that are `knowable`, and those `beside` cameras; whether these `stand_outside`."""
+        (allowed, near), outside = places
+        self.on_progress, self.on_step = told
         self.model, self.config = model, config
         device = model.encoding.tables.device
         with torch.device("cpu"):  # photos are read and posed there
             self.pixels = DevicePixels(photos.bank(), device)
             self.judge = photos.judge()
-            outside = stand_outside(model.contraction, photos.train)
         if self.judge.rays is not None:
             r = self.judge.rays
             self.judge.rays = Rays(r.origins.to(device), r.directions.to(device))
             self.judge.truth = self.judge.truth.to(device)
-        self.occupancy = OccupancyTrainer(model, allowed=allowed, outside=outside)
+        self.occupancy = OccupancyTrainer(model, allowed=allowed, outside=outside, beside=near if outside else None)
         model.looking_where(allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.grid = model.sampler.grid.clone()  # the one that graphs read
         self.descent = Descent(model)

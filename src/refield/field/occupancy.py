@@ -42,9 +42,11 @@ class OccupancyTrainer:
         allowed: Tensor | None = None,
         doubt: float = 2 * _OPACITY,
         outside: bool = True,
+        beside: Tensor | None = None,
     ) -> None:
         """``allowed`` (R**3,) bool: cells that may hold something at all; all by default. ``doubt``: the opacity that
-        cells begin with, except where cameras stand. ``outside``: whether they stand around the core."""
+        cells begin with, except where cameras stand. ``outside``: whether they stand around the core. ``beside``
+        (R**3,) bool: cells right beside one of them."""
         self.model, self.cull_from = model, cull_from
         device = model.sampler.grid.device
         cells = model.sampler.resolution**3
@@ -62,6 +64,8 @@ class OccupancyTrainer:
             self.state[some, 2] = model.sampler.step_at(some)
             distance = model.sampler.distance(some)
             self.among_cameras[some] = (distance > 1) & (distance < _CAMERAS) & outside
+            if beside is not None:
+                self.among_cameras[some] |= beside[some]
             self.state[some, 0] = torch.where(self.among_cameras[some], 0.0, doubt)
             self.state[some, 3] = torch.where(distance > _BACKGROUND, 0.0, -1.0)
 
