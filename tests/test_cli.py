@@ -87,7 +87,7 @@ def test_render_gives_pictures_the_look_of_a_photo(place, capsys):
     looks = {"neutral": [], "dark": ["--look", dark.name], "other": ["--look", Path(given.frames[1].name).stem]}
     for out, look in looks.items():
         assert main([*argv, out, *look]) == 0
-    neutral, darkened, other = (read_image(place / out / "001.png").astype(float) for out in looks)
+    neutral, darkened, other = (read_image(place / out / "001.png").double().numpy() for out in looks)
     assert np.abs(darkened - neutral * [0.5, 0.5, 0.25]).max() <= 1 and neutral.max() > 20
     assert np.array_equal(other, neutral)
     assert main([*argv, "none", "--look", "nowhere.jpg"]) == 2
