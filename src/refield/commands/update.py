@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Annotated
 
 from torch import Tensor
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from refield.commands.clock import Clock
+from refield.commands.options import Output
 from refield.commands.page import page
 from refield.commands.placing import Placing, placed_photos
 from refield.estimate.localize import LocalizeConfig
@@ -36,6 +37,7 @@ from refield.workspace import Workspace
 SHOWN = 256 * 256
 """pixels, about and at most, of what a field shows of a new photo on the page"""
 SHEET = "before-after.png"
+EXAMPLES = ("refield update work after",)
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class Update:
     """photos without poses: how they are placed"""
     estimate: EstimateConfig = field(default_factory=EstimateConfig)
     update: UpdateConfig = field(default_factory=UpdateConfig)
+    output: OmitArgPrefixes[Output] = Output()
 
 
 @dataclass(frozen=True)
