@@ -38,9 +38,9 @@ class EvaluateConfig:
     margin: int = 4
     """untouched pixels are those in neither mask dilated by so many pixels"""
     crop: int = 256
-    """side to which the masks' bounding boxes are resized for SSIM and LPIPS (§11.2)"""
+    """side to which the masks' bounding boxes are resized for SSIM and LPIPS"""  # §11.2
     align: bool = False
-    """align each render to its photo by a homography first (§5.3): for photos whose poses are not exact"""
+    """align each render to its photo by a homography first: for photos whose poses are not exact"""  # §5.3
 
 
 @dataclass(frozen=True)

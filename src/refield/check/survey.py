@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -185,3 +186,27 @@ def told(world: Path | str, survey: Survey) -> str:
     if survey.faults:
         return f"{world}: not usable: {'; '.join(survey.faults)}"
     return f"{world}: usable"
+
+
+def survey_document(survey: Survey) -> dict[str, Any]:
+    """The same for programs: lengths in units of the world, angles in degrees, bytes, seconds."""
+    coverage = survey.coverage
+    around = None if coverage is None else {k: getattr(coverage, k) for k in ("around", "lowest", "highest", "seen_by")}
+    return {
+        "usable": not survey.faults,
+        "faults": survey.faults,
+        "advice": survey.advice,
+        "photos": [
+            {"name": name, "sharpness": look.sharpness, "brightness": look.brightness}
+            for name, look in zip(survey.names, survey.looks)
+        ],
+        "skipped": [{"name": name, "why": why} for name, why in survey.left_out],
+        "sizes": [{"width": w, "height": h, "photos": n} for (w, h), n in survey.sizes.most_common()],
+        "cameras": survey.cameras,
+        "brightness_stops": stops(survey.looks) if survey.looks else None,
+        "coverage": around,
+        "points": None if survey.capture is None else len(survey.capture.points),
+        "size": None if survey.world is None else survey.world.size,
+        "memory_bytes": survey.memory.total,
+        "seconds_expected": survey.seconds,
+    }

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Annotated
 
 from rich.table import Table
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from refield.artefacts import writable
 from refield.check.picture import camera_picture
-from refield.check.survey import Survey, survey_capture, survey_photos, told
-from refield.commands.clock import Clock, results
+from refield.check.survey import Survey, survey_capture, survey_document, survey_photos, told
+from refield.commands.answer import Answer
+from refield.commands.clock import Clock, duration
+from refield.commands.options import PLAIN, Output
 from refield.field.fit import FitConfig
 from refield.field.quality import OPEN, Quality
 from refield.photos.capture import FromPhotosConfig, capture_from_photos
@@ -24,6 +26,8 @@ from refield.scene.images import is_ours, write_image
 from refield.scene.left_out import named
 from refield.scene.load import is_posed, load_capture
 from refield.workspace import MARKER, Workspace, refuse_inside
+
+EXAMPLES = ("refield check before", "refield check before --work work")
 
 
 @dataclass(frozen=True)
@@ -42,28 +46,30 @@ class Check:
     """of the fit, for its memory and time"""
     fit: FitConfig = OPEN
     """what would be fitted"""
+    output: OmitArgPrefixes[Output] = PLAIN
 
 
-def run(options: Check) -> None:
-    clock = Clock()
+def run(options: Check) -> Answer:
+    clock = Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     refuse_inside(options.picture, *([] if options.work is None else [options.work]))
     if options.picture.exists() and not is_ours(options.picture):
         raise InputError(options.picture, "is there and was not made by refield", "choose another --picture")
     survey = check(options, clock)
-    results().print(_table(survey))
-    for name, why in survey.left_out:
-        print(f"skipped: {name}: {why}")
-    for line in survey.advice:
-        print(f"advice: {line}")
+    clock.stop()
+    words: list[str | Table] = [_table(survey), *(f"skipped: {name}: {why}" for name, why in survey.left_out)]
+    words += [f"advice: {line}" for line in survey.advice]
+    picture = None
     if survey.capture is not None and survey.world is not None:
         with writable(options.picture):
             write_image(options.picture, camera_picture(survey.capture, survey.world))
-        print(f"cameras: {options.picture}")
+        picture = options.picture
+        words.append(f"cameras: {picture}")
     elif not survey.faults:
-        print(f"cameras: not known yet; refield check {options.data} --work WORK finds them and keeps them for train")
+        words.append(f"cameras: not known yet; refield check {options.data} --work WORK finds and keeps them for train")
+    document = {"data": options.data, **survey_document(survey), "picture": picture, "warnings": clock.warnings}
     if survey.faults:
-        raise InputError(options.data, "not usable", "; ".join(survey.faults))
-    print(told(options.data, survey))
+        return Answer(document, words, stop=InputError(options.data, "not usable", "; ".join(survey.faults)))
+    return Answer(document, [*words, told(options.data, survey)])
 
 
 def check(options: Check, clock: Clock) -> Survey:
@@ -117,9 +123,5 @@ def _table(survey: Survey) -> Table:
         table.add_row("size", f"{survey.world.size:.3g} units between the outermost cameras")
     table.add_row("memory for the fit", str(survey.memory))
     for stage, seconds in survey.seconds.items():
-        table.add_row(f"time: {stage}", f"about {_time(seconds)} on this machine")
+        table.add_row(f"time: {stage}", f"about {duration(seconds)} on this machine")
     return table
-
-
-def _time(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -24,14 +25,23 @@ def results() -> Console:
 
 
 class Clock:
-    """Keeps the time of each stage, and what the user was warned of."""
+    """Keeps the time of each stage, and what the user was warned of.
 
-    def __init__(self) -> None:
-        self.console = Console(stderr=True, highlight=False, soft_wrap=True)
+    Of the two streams that it writes, warnings are heard even where the rest is ``quiet``.
+    """
+
+    def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
+        self.console = Console(stderr=True, highlight=False, soft_wrap=True, quiet=quiet)
+        self._warnings = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._verbose = verbose
         self.seconds: dict[str, float] = {}
         self.warnings: list[str] = []
         self._stage: str | None = None
         self._since = self._began = time.perf_counter()
+
+    @property
+    def _animated(self) -> bool:
+        return self.console.is_terminal and not self.console.quiet
 
     @property
     def total(self) -> float:
@@ -52,12 +62,15 @@ class Clock:
     def warn(self, message: str) -> None:
         """The ``warn`` of every loader."""
         self.warnings.append(message)
-        self.console.print(f"warning: {message}", markup=False)
+        self._warnings.print(f"warning: {message}", markup=False)
 
     def _close(self) -> None:
         now = time.perf_counter()
         if self._stage is not None:
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+            if self._verbose:
+                told = f"{now - self._since:.1f} s, {_peak_memory() / 1e6:.0f} MB at most so far"
+                self.console.print(f"           {told}", markup=False)
         self._since = now
 
     @contextlib.contextmanager
@@ -70,7 +83,7 @@ class Clock:
             TimeRemainingColumn(),
             console=self.console,
             transient=True,
-            disable=not self.console.is_terminal,
+            disable=not self._animated,
         )
         with progress:
             task = progress.add_task(what, total=None)
@@ -83,7 +96,7 @@ class Clock:
         with contextlib.ExitStack() as stack:
 
             def count(what: str) -> Callable[[int, int], None]:
-                if self.console.is_terminal:
+                if self._animated:
                     stack.close()  # the one before it is done
                     return stack.enter_context(self.counting(what))
                 return self._lines(what)
@@ -110,7 +123,7 @@ class Clock:
             TextColumn("{task.fields[facts]}"),
             console=self.console,
             transient=True,
-            disable=not self.console.is_terminal,
+            disable=not self._animated,
         )
         with progress:
             task = progress.add_task(name, total=1, facts="starting")
@@ -156,3 +169,14 @@ def _facts(look: Look) -> str:
     else:
         left = look.seconds * (look.steps / max(look.step, 1) - 1)
     return "  ".join([*parts, f"{left:.0f} s left"])
+
+
+def _peak_memory() -> float:
+    """Bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def duration(seconds: float) -> str:
+    """About so long, in words."""
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

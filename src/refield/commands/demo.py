@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 from rich.table import Table
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from refield.commands.clock import Clock, results
+from refield.commands.answer import Answer
+from refield.commands.clock import Clock
 from refield.commands.evaluate import table
+from refield.commands.options import PLAIN, Output
 from refield.commands.train import Sources, train
-from refield.commands.update import Update, Visit, update
+from refield.commands.update import Update, Visit, facts_of, update
 from refield.evaluate import pose_error
 from refield.field.fit import FitConfig
 from refield.report import summary
@@ -21,6 +24,8 @@ from refield.scene.change import SceneChange
 from refield.scene.change_files import load_change
 from refield.synthetic import sample_folder
 from refield.workspace import Workspace
+
+EXAMPLES = ("refield demo",)
 
 
 @dataclass(frozen=True)
@@ -30,10 +35,11 @@ class Demo:
     out: Annotated[Path, arg(metavar="OUT"), Positional] = Path("refield-demo")
     """the workspace to make; one that an earlier demo made is replaced"""
     fit: FitConfig = field(default_factory=FitConfig)
+    output: OmitArgPrefixes[Output] = PLAIN
 
 
-def run(options: Demo) -> None:
-    clock = Clock()
+def run(options: Demo) -> Answer:
+    clock = Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     sample = sample_folder()
     again = Workspace.made_by(options.out) == "demo"
     Workspace.refuse_unless_free(options.out, overwrite=again, option=None)
@@ -41,29 +47,31 @@ def run(options: Demo) -> None:
     psnr = train(task, clock, options.fit, overwrite=again, made_by="demo")
     facts = {} if math.isnan(psnr) else {"held-out PSNR of the field (dB)": round(psnr, 2)}
     visit = update(Update(options.out, sample / "after", evaluation=sample / "eval"), clock, facts)
-    _show(visit, load_change(sample / "truth"), psnr, clock)
-    print(f"report: {visit.html}")
+    errors = pose_errors(visit.change, load_change(sample / "truth"))
+    words = [*_words(visit, psnr, errors, clock), f"report: {visit.html}"]
     if visit.sheet.exists():
-        print(f"before and after: {visit.sheet}")
+        words.append(f"before and after: {visit.sheet}")
+    about = {"held_out_psnr": psnr, "warnings": clock.warnings, "seconds_per_stage": clock.seconds}
+    off = [{"shift_cm": shift, "turn_deg": turn} for shift, turn in errors]
+    return Answer(facts_of(options.out, visit) | about | {"errors_of_pose_changes": off}, words)
 
 
-def _show(visit: Visit, truth: SceneChange, psnr: float, clock: Clock) -> None:
-    console = results()
-    console.print(summary(visit.change))
+def _words(visit: Visit, psnr: float, errors: Sequence[tuple[float, float]], clock: Clock) -> list[str | Table]:
+    out: list[str | Table] = [summary(visit.change)]
     if visit.evaluation is not None:
-        console.print(table(visit.evaluation, "views that nothing was fitted to"))
+        out.append(table(visit.evaluation, "views that nothing was fitted to"))
     numbers = Table("", "", title="numbers", show_header=False)
     numbers.add_row("held-out PSNR of the first field", f"{psnr:.2f} dB")
-    for name, value in pose_errors(visit.change, truth):
-        numbers.add_row(name, value)
+    for shift, turn in errors:
+        numbers.add_row("error of the pose change", f"{shift:.2f} cm, {turn:.2f}°")
     for stage, seconds in clock.seconds.items():
         numbers.add_row(stage, f"{seconds:.1f} s")
     numbers.add_row("whole demo", f"{clock.total:.1f} s")
-    console.print(numbers)
+    return [*out, numbers]
 
 
-def pose_errors(change: SceneChange, truth: SceneChange) -> list[tuple[str, str]]:
-    """Each moved object's pose change against the nearest true one's."""
+def pose_errors(change: SceneChange, truth: SceneChange) -> list[tuple[float, float]]:
+    """Each moved object's pose change against the nearest true one's, cm and degrees."""
     out = []
     true = [o for o in truth.objects if o.new_from_old is not None]
     for found in change.objects:
@@ -73,5 +81,5 @@ def pose_errors(change: SceneChange, truth: SceneChange) -> list[tuple[str, str]
         match = min(true, key=lambda o: float((o.grid.tight_aabb().mean(0) - centre).norm()))
         assert match.new_from_old is not None
         shift, turn = pose_error(found.new_from_old, match.new_from_old, match.grid.tight_aabb().mean(0))
-        out.append(("error of the pose change", f"{shift * 100:.2f} cm, {turn:.2f}°"))
+        out.append((shift * 100, turn))
     return out

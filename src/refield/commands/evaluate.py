@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Annotated
 
 from rich.table import Table
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from refield.artefacts import writable
-from refield.commands.clock import Clock, results
+from refield.commands.answer import Answer
+from refield.commands.clock import Clock
+from refield.commands.options import PLAIN, Output
 from refield.commands.placing import Placing, placed_photos
 from refield.estimate.localize import LocalizeConfig
 from refield.evaluate import EvaluateConfig, Report, Scores, evaluate, looked_over, need_masks
@@ -25,6 +27,8 @@ from refield.scene.load import is_posed
 from refield.vision.perceptual import Perceptual, open_lpips
 from refield.vision.weights import WeightsError
 from refield.workspace import Workspace, refuse_inside
+
+EXAMPLES = ("refield evaluate work eval", "refield evaluate work eval --out numbers.json")
 
 
 @dataclass(frozen=True)
@@ -47,13 +51,14 @@ class Evaluate:
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     """photos without poses: how they are placed"""
     config: EvaluateConfig = field(default_factory=EvaluateConfig)
+    output: OmitArgPrefixes[Output] = PLAIN
 
 
-def run(options: Evaluate) -> None:
+def run(options: Evaluate) -> Answer:
     if options.out is not None:
         _refuse_unless_free(options.out)
     perceptual = _opened(options.lpips)
-    clock = Clock()
+    clock = Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     workspace = Workspace.open(options.work)
     visit = workspace.chosen_visit(options.visit)
     with contextlib.ExitStack() as held:
@@ -65,11 +70,13 @@ def run(options: Evaluate) -> None:
         clock.stage("evaluate")
         report = evaluate(now, options.eval, old=before, frames=views, config=options.config, perceptual=perceptual)
     clock.stop()
+    left_out = [{"name": p.name, "why": p.why} for p in placed if p.frame is None]
+    numbers = report.to_dict() | {"left_out": left_out}
     if options.out is not None:
         with writable(options.out):
-            left_out = [{"name": p.name, "why": p.why} for p in placed if p.frame is None]
-            write_json(options.out, report.to_dict() | {"left_out": left_out})
-    results().print(table(report, f"visit {visit}"))
+            write_json(options.out, numbers)
+    about = {"workspace": options.work, "visit": visit, "seconds_per_stage": clock.seconds, "warnings": clock.warnings}
+    return Answer(about | numbers, [table(report, f"visit {visit}")])
 
 
 def _refuse_unless_free(out: Path) -> None:

@@ -8,12 +8,13 @@ says otherwise (False).
 from __future__ import annotations
 
 import importlib
+import platform
 import types
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
-from functools import cache
+from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Suppress, arg
@@ -36,6 +37,9 @@ class Output:
     """tell versions and settings first, and what memory was taken after each stage"""
 
 
+PLAIN = Output()
+
+
 def kind_of(command: str) -> type[Any]:
     """The dataclass with a command's options."""
     return getattr(importlib.import_module(f"refield.commands.{command}"), command.capitalize())
@@ -56,6 +60,27 @@ def parsed(kind: type[Asked], arguments: Sequence[str], command: str) -> Asked:
         finally:
             print(_foot(kind, command))
     return tyro.cli(kind, args=list(arguments), prog=prog)
+
+
+def foreword(options: Any, command: str) -> list[str]:
+    """Versions, and the settings that are not the usual ones."""
+    from refield import __version__
+
+    packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "numba", "pycolmap"))
+    usual = {f.name: f.default for f in fields(options) if f.default is not MISSING}
+    usual |= {f.name: f.default_factory() for f in fields(options) if f.default_factory is not MISSING}
+    settings = [
+        line for f in fields(options) for line in _differing(f.name, getattr(options, f.name), usual.get(f.name))
+    ]
+    return [f"refield {__version__} {command}, Python {platform.python_version()}, {packages}", *settings]
+
+
+def _differing(name: str, value: Any, usual: Any) -> list[str]:
+    """``name: value`` of everything in ``value`` that is not as usual."""
+    if is_dataclass(value) and type(value) is type(usual):
+        parts = [_differing(f"{name}.{f.name}", getattr(value, f.name), getattr(usual, f.name)) for f in fields(value)]
+        return [line for part in parts for line in part]
+    return [] if value == usual else [f"           {name.replace('_', '-')}: {value}"]
 
 
 def _foot(kind: type[Any], command: str) -> str:
@@ -84,7 +109,6 @@ def names(kind: type[Any], *, whole: bool = True, top: bool = True) -> list[str]
     return out
 
 
-@cache
 def shown(kind: type[Any], *, whole: bool) -> type[Any]:
     """The same options for the eye of a reader: with ``--help-all``, and unless ``whole`` without those that matter to
     few."""
@@ -122,6 +146,7 @@ def _short(hint: Any, default: Any) -> tuple[Any, ...]:
         return (FlagCreatePairsOff, arg(help_behavior_hint=""))
     if get_origin(hint) in (Union, types.UnionType) and default is None:
         kinds = [_NAMES[part] for part in get_args(hint) if part in _NAMES]
+        kinds += ["{" + ",".join(get_args(part)) + "}" for part in get_args(hint) if get_origin(part) is Literal]
         return (arg(metavar=kinds[0], help_behavior_hint=""),) if kinds else ()
     return ()
 

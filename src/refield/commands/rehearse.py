@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rich.table import Table
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from refield.artefacts import writable
 from refield.check.survey import survey_capture
-from refield.commands.clock import Clock, results
+from refield.commands.answer import Answer
+from refield.commands.clock import Clock, duration
+from refield.commands.options import PLAIN, Output
 from refield.commands.train import Sources, train
 from refield.commands.update import Update, Visit, update
 from refield.evaluate import Report
@@ -34,6 +36,9 @@ from refield.workspace import Workspace, refuse_inside
 
 REPORT = "rehearsals.json"
 _MOST = 100
+
+
+EXAMPLES = ("refield rehearse work", "refield rehearse work --seeds 0..6 --out rehearsals")
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,7 @@ class Rehearse:
     quality: Quality = "draft"
     """of the rehearsed fits, as `refield train` has it"""
     fit: FitConfig = OPEN
+    output: OmitArgPrefixes[Output] = PLAIN
 
 
 @dataclass(frozen=True)
@@ -83,19 +89,21 @@ class Rehearsed:
         }
 
 
-def run(options: Rehearse) -> None:
-    seeds, clock = seeds_of(options.seeds), Clock()
+def run(options: Rehearse) -> Answer:
+    seeds, clock = seeds_of(options.seeds), Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     if options.out is not None:
         _refuse_unless_free(options.work, options.out)
     scenery, size = prepared(options.work, clock, (options.fit, options.quality), len(seeds))
     done: list[Rehearsed] = []
+    stop: BaseException | None = None
     try:
         with _folder(options.out) as folder:
             _rehearse_all(scenery, size, folder, seeds, clock, options, done)
-    finally:  # what is done has taken long, and is told whatever comes
-        clock.stop()
-        if done:
-            results().print(table(done, size))
+    except BaseException as error:
+        stop = error  # what is done has taken long, and is told whatever comes
+    clock.stop()
+    document = {"workspace": options.work, "warnings": clock.warnings, **_record(done, size)}
+    return Answer(document, [table(done, size)] if done else [], stop=stop)
 
 
 def _rehearse_all(
@@ -125,7 +133,7 @@ def _rehearse_all(
             write_json(options.out / REPORT, _record(done, size))
         left = (len(seeds) - k) * sum(r.seconds for r in done) / len(done)
         if left:
-            clock.console.print(f"           {k} of {len(seeds)} rehearsed, about {_time(left)} left")
+            clock.console.print(f"           {k} of {len(seeds)} rehearsed, about {duration(left)} left")
 
 
 def prepared(work: Path, clock: Clock, asked: tuple[FitConfig, Quality], count: int) -> tuple[Scenery, float]:
@@ -138,7 +146,7 @@ def prepared(work: Path, clock: Clock, asked: tuple[FitConfig, Quality], count: 
     capture = workspace.capture()
     divided(capture)
     seconds = sum(survey_capture(capture, asked).seconds.values())
-    each = f"each about one training (some {_time(seconds)} on this machine) and one update"
+    each = f"each about one training (some {duration(seconds)} on this machine) and one update"
     clock.console.print(f"{count} rehearsals, {each}; Ctrl-C leaves nothing half done", markup=False)
     clock.stage("find out how far off things are")
     with clock.counting("views") as tell:
@@ -244,10 +252,6 @@ def _decibels(report: Report | None, region: str) -> str:
 
 def _record(done: Sequence[Rehearsed], size: float) -> dict[str, Any]:
     return {"scene_size": size, "rehearsals": [r.to_dict() for r in done]}
-
-
-def _time(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
 @contextlib.contextmanager

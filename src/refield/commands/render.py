@@ -6,20 +6,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from refield.artefacts import writable
+from refield.commands.answer import Answer
 from refield.commands.clock import Clock
+from refield.commands.options import PLAIN, Output
 from refield.field.radiance import Field
 from refield.field.render import render_frame
 from refield.history import state
 from refield.scene.capture import Frame
-from refield.scene.errors import InputError
+from refield.scene.errors import InputError, did_you_mean
 from refield.scene.exposure import Exposure
 from refield.scene.images import is_ours, write_image
 from refield.scene.left_out import named
 from refield.scene.transforms_json import load_cameras, stem
 from refield.workspace import Workspace, refuse_inside
+
+EXAMPLES = (
+    "refield render work --cameras work/visits/001/photos/transforms.json --out pictures",
+    "refield render work --cameras before/transforms.json --out pictures --visit 0",
+)
 
 
 @dataclass(frozen=True)
@@ -39,10 +46,11 @@ class Render:
     photos' mean exposure, and no vignetting"""
     overwrite: bool = False
     """replace pictures in ``out`` that refield did not write"""
+    output: OmitArgPrefixes[Output] = PLAIN
 
 
-def run(options: Render) -> None:
-    clock = Clock()
+def run(options: Render) -> Answer:
+    clock = Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     workspace = Workspace.open(options.work)
     visit = workspace.chosen_visit(options.visit)
     frames = load_cameras(options.cameras, warn=clock.warn)
@@ -50,7 +58,8 @@ def run(options: Render) -> None:
     paths = output_paths(options.cameras, frames, options.out, overwrite=options.overwrite)
     clock.stage(f"load the field as of visit {visit}")
     render(state(workspace, visit), frames, paths, clock, exposure)
-    print(f"{len(paths)} pictures in {options.out}")
+    facts = {"workspace": options.work, "visit": visit, "pictures": paths, "seconds_per_stage": clock.seconds}
+    return Answer(facts | {"warnings": clock.warnings}, [f"{len(paths)} pictures in {options.out}"])
 
 
 def exposure_of(workspace: Workspace, photo: str) -> Exposure:
@@ -64,7 +73,8 @@ def exposure_of(workspace: Workspace, photo: str) -> Exposure:
         if photo in (frame.name, Path(frame.name).name, stem(frame)):
             return frame.exposure or Exposure()
     where = workspace.path / "capture" / "transforms.json"
-    raise InputError(where, f"names no photo {photo!r}", f"give one of its photos, such as {frames[0].name}")
+    near = did_you_mean(photo, [frame.name for frame in frames])
+    raise InputError(where, f"names no photo {photo!r}", f"{near}give one of its photos, such as {frames[0].name}")
 
 
 def render(
@@ -72,13 +82,20 @@ def render(
 ) -> None:
     """Write one picture per frame, neutral or as a photo of that exposure."""
     clock.stage(f"render {len(frames)} views")
-    for frame, path in zip(frames, paths):
-        picture = render_frame(field, frame).rgb
-        if exposure is not None:
-            picture = exposure.taken(picture, frame.camera)
-        with writable(path):
-            write_image(path, picture)
+    with clock.counters() as counters:
+        count = counters("views")
+        for done, (frame, path) in enumerate(zip(frames, paths), 1):
+            _render(field, frame, path, exposure)
+            count(done, len(frames))
     clock.stop()
+
+
+def _render(field: Field, frame: Frame, path: Path, exposure: Exposure | None) -> None:
+    picture = render_frame(field, frame).rgb
+    if exposure is not None:
+        picture = exposure.taken(picture, frame.camera)
+    with writable(path):
+        write_image(path, picture)
 
 
 def output_paths(cameras: Path, frames: list[Frame], out: Path, *, overwrite: bool) -> list[Path]:

@@ -12,7 +12,9 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from refield.artefacts import writable
+from refield.commands.answer import Answer
 from refield.commands.clock import Clock
+from refield.commands.options import PLAIN, Output
 from refield.scene.errors import InputError
 from refield.synthetic.random_write import write_random
 from refield.synthetic.write import SynthConfig, write_world
@@ -20,6 +22,9 @@ from refield.workspace import refuse_inside
 
 RANDOM = "random"
 _OF_RANDOM = {"photos": "give --cameras for {}", "path": "leave it out", "mixed": "leave it out"}
+
+
+EXAMPLES = ("refield synth cube out", "refield synth random out --seed 7")
 
 
 @dataclass(frozen=True)
@@ -36,15 +41,15 @@ class Synth:
     overwrite: bool = False
     """write into a folder that is not empty"""
     config: OmitArgPrefixes[SynthConfig] = field(default_factory=SynthConfig)
+    output: OmitArgPrefixes[Output] = PLAIN
 
 
-def run(options: Synth) -> None:
-    clock = Clock()
+def run(options: Synth) -> Answer:
+    clock = Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     _refuse_unless_free(options.out, overwrite=options.overwrite)
     _refuse_the_others_options(options)
     if options.into is not None:
-        _into(options, options.into, clock)
-        return
+        return _into(options, options.into, clock)
     clock.stage(f"path-trace {options.world}")
     with writable(options.out), clock.counting("photos") as count:
         if options.world == RANDOM:
@@ -54,10 +59,11 @@ def run(options: Synth) -> None:
             named = {name: value for name, value in told.items() if name not in _OF_RANDOM}
             write_world(options.world, options.out, **named, on_progress=count)
     clock.stop()
-    print(f"{options.world} is in {options.out} ({clock.total:.0f} s)")
+    facts = {"world": options.world, "out": options.out, "seconds": clock.total}
+    return Answer(facts, [f"{options.world} is in {options.out} ({clock.total:.0f} s)"])
 
 
-def _into(options: Synth, work: Path, clock: Clock) -> None:
+def _into(options: Synth, work: Path, clock: Clock) -> Answer:
     """Put objects into the photos of a workspace."""
     from refield.commands.rehearse import opened
     from refield.rehearse.compose import compose, divided, scenery_of
@@ -74,7 +80,8 @@ def _into(options: Synth, work: Path, clock: Clock) -> None:
     with writable(options.out), clock.counting("photos") as count:
         plan = compose(scenery, options.out, options.config.seed, count)
     clock.stop()
-    print(f"{plan.facts['happening']}: {options.out} ({clock.total:.0f} s)")
+    facts = {"world": options.world, "out": options.out, "seconds": clock.total, "happening": plan.facts["happening"]}
+    return Answer(facts, [f"{plan.facts['happening']}: {options.out} ({clock.total:.0f} s)"])
 
 
 def _refuse_the_others_options(options: Synth) -> None:

@@ -7,9 +7,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from refield.commands.answer import Answer
 from refield.commands.clock import Clock
+from refield.commands.options import PLAIN, Output
 from refield.field.descent import NonFiniteError
 from refield.field.fit import FitConfig, ProgressCallback, fit_capture
 from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig, fit_nerfacto
@@ -27,6 +29,12 @@ from refield.scene.load import is_posed, load_capture
 from refield.scene.refined import in_words
 from refield.scene.world import world_of
 from refield.workspace import Workspace
+
+EXAMPLES = (
+    "refield train before work",
+    "refield train before work --quality best --fit.max-seconds 600",
+    "refield train work --more",
+)
 
 
 @dataclass(frozen=True)
@@ -53,21 +61,28 @@ class Train:
     what a CPU can train in minutes, which heeds no ``nerfacto`` option but the time limit, the seed, and those of the
     photos"""
     fit: FitConfig = OPEN
-    nerfacto: NerfactoFitConfig = field(default_factory=NerfactoFitConfig)
+    nerfacto: NerfactoFitConfig = field(default_factory=NerfactoFitConfig, metadata={"usual": False})
+    output: OmitArgPrefixes[Output] = PLAIN
 
 
-def run(options: Train) -> None:
-    clock = Clock()
+def run(options: Train) -> Answer:
+    clock = Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     if options.more:
-        psnr = train_more(options.data, clock, options.fit, options.quality)
-        clock.console.print(f"The field is in {options.data} ({psnr:.2f} dB, {clock.total:.1f} s).", markup=False)
-        return
+        return _answer(options.data, train_more(options.data, clock, options.fit, options.quality), clock)
     if options.work == Path():
         raise InputError("WORK", "is not given", "name the folder in which to make the workspace")
     _check_scale(options.scale)
     task = Sources(options.data, options.work, options.poses, options.scale)
-    train(task, clock, _config_of(options), overwrite=options.overwrite, quality=options.quality)
-    clock.console.print(f"The field is in {options.work} ({clock.total:.1f} s).", markup=False)
+    psnr = train(task, clock, _config_of(options), overwrite=options.overwrite, quality=options.quality)
+    return _answer(options.work, psnr, clock)
+
+
+def _answer(work: Path, psnr: float, clock: Clock) -> Answer:
+    known = f"{psnr:.2f} dB on held-out pixels, " if math.isfinite(psnr) else ""
+    capture = Workspace.open(work).capture()
+    document = {"workspace": work, "photos": len(capture.frames), "held_out_psnr": psnr, "warnings": clock.warnings}
+    document |= {"seconds": clock.total, "seconds_per_stage": clock.seconds}
+    return Answer(document, [f"The field is in {work} ({known}{clock.total:.1f} s)."])
 
 
 def _config_of(options: Train) -> FitConfig | NerfactoFitConfig:

@@ -6,10 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from refield.commands.answer import Answer
+from refield.commands.options import PLAIN, Output
 from refield.scene.errors import InputError
 from refield.workspace import Workspace
+
+EXAMPLES = ("refield undo work",)
 
 
 @dataclass(frozen=True)
@@ -18,9 +22,10 @@ class Undo:
 
     work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace"""
+    output: OmitArgPrefixes[Output] = PLAIN
 
 
-def run(options: Undo) -> None:
+def run(options: Undo) -> Answer:
     workspace = Workspace.open(options.work)
     with workspace.writing():
         number = workspace.visits
@@ -28,4 +33,5 @@ def run(options: Undo) -> None:
             what = "has had no visit, so there is nothing to take back"
             raise InputError(options.work, what, f"make one with: refield update {options.work} PHOTOS")
         workspace.drop_last_visit()
-    print(f"visit {number} is taken back; {options.work} is as it was after visit {number - 1}")
+    words = f"visit {number} is taken back; {options.work} is as it was after visit {number - 1}"
+    return Answer({"workspace": options.work, "undone": number, "visits": number - 1}, [words])

@@ -6,15 +6,17 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from torch import Tensor
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
+from refield.commands.answer import Answer, Exit
 from refield.commands.clock import Clock
-from refield.commands.options import Output
+from refield.commands.options import PLAIN, Output
 from refield.commands.page import page
 from refield.commands.placing import Placing, placed_photos
+from refield.commands.visits import visit_facts
 from refield.estimate.localize import LocalizeConfig
 from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.evaluate import Report, evaluate, looked_over
@@ -37,7 +39,10 @@ from refield.workspace import Workspace
 SHOWN = 256 * 256
 """pixels, about and at most, of what a field shows of a new photo on the page"""
 SHEET = "before-after.png"
-EXAMPLES = ("refield update work after",)
+EXAMPLES = (
+    "refield update work after",
+    "refield update work after --exit-code --json > change.json",
+)
 
 
 @dataclass(frozen=True)
@@ -50,13 +55,15 @@ class Update:
     """the new photos: their folder; or a transforms.json or its folder, with poses in the world of the old ones"""
     evaluation: Path | None = None
     """a folder of further photos (transforms.json, images/, masks_in/, masks_out/) to measure by"""
+    exit_code: Annotated[bool, FlagCreatePairsOff] = False
+    """end with 10 if objects changed, 11 if something changed that is not understood, 0 if nothing did"""
     intake: PhotoConfig = field(default_factory=PhotoConfig)
     """photos without poses: how they are taken in"""
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     """photos without poses: how they are placed"""
     estimate: EstimateConfig = field(default_factory=EstimateConfig)
     update: UpdateConfig = field(default_factory=UpdateConfig)
-    output: OmitArgPrefixes[Output] = Output()
+    output: OmitArgPrefixes[Output] = PLAIN
 
 
 @dataclass(frozen=True)
@@ -77,14 +84,25 @@ class Visit:
         return self.folder / SHEET
 
 
-def run(options: Update) -> None:
-    clock = Clock()
+def run(options: Update) -> Answer:
+    clock = Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     visit = update(options, clock)
-    unclear = visit.change.objects or visit.change.unexplained
-    print(summary(visit.change) if unclear else "nothing changed")
-    if visit.change.why:
-        print(visit.change.why)
-    print(f"report: {visit.html}")
+    change = visit.change
+    unclear = change.objects or change.unexplained
+    words = [summary(change) if unclear else "nothing changed", change.why, f"report: {visit.html}"]
+    code = Exit.CHANGED if change.objects else Exit.UNCLEAR if change.unexplained else Exit.DONE
+    document = facts_of(options.work, visit) | {"warnings": clock.warnings, "seconds_per_stage": clock.seconds}
+    return Answer(document, [line for line in words if line], code if options.exit_code else Exit.DONE)
+
+
+def facts_of(work: Path, visit: Visit) -> dict[str, Any]:
+    """A visit as ``refield visits --json`` tells it, its photos one by one, and the numbers of its evaluation."""
+    return {
+        "workspace": work,
+        **visit_facts(Workspace(work), int(visit.folder.name)),
+        "photos": [{"name": p.name, "status": p.status, "why": p.why} for p in visit.change.photos],
+        "evaluation": None if visit.evaluation is None else visit.evaluation.to_dict(),
+    }
 
 
 def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | None = None) -> Visit:

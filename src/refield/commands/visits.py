@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from rich.table import Table
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from refield.commands.clock import results
+from refield.commands.answer import Answer
+from refield.commands.options import PLAIN, Output
 from refield.history import changed_visits
 from refield.report import object_shift, turn
 from refield.scene.change import ObjectChange, SceneChange
+from refield.scene.change_files import NAME as CHANGE
 from refield.scene.files import read_json
 from refield.workspace import Workspace
+
+EXAMPLES = ("refield visits work", "refield visits work --json")
 
 
 @dataclass(frozen=True)
@@ -25,24 +28,22 @@ class Visits:
 
     work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace"""
-    json: bool = False
-    """print JSON in place of a table"""
+    output: OmitArgPrefixes[Output] = PLAIN
 
 
-def run(options: Visits) -> None:
+def run(options: Visits) -> Answer:
     workspace = Workspace.open(options.work)
-    visits = [_visit(workspace, number) for number in range(1, workspace.visits + 1)]
-    if options.json:
-        print(json.dumps({"workspace": str(options.work), "visits": visits}, indent=1))
-    elif not visits:
-        print(f"{options.work} has had no visit; make one with: refield update {options.work} PHOTOS")
-    else:
-        results().print(_table(visits))
+    visits = [visit_facts(workspace, number) for number in range(1, workspace.visits + 1)]
+    none = f"{options.work} has had no visit; make one with: refield update {options.work} PHOTOS"
+    return Answer({"workspace": options.work, "visits": visits}, [_table(visits) if visits else none])
 
 
-def _visit(workspace: Workspace, number: int) -> dict[str, Any]:
-    change, report = workspace.change(number, masks=False), workspace.visit(number) / "report.json"
+def visit_facts(workspace: Workspace, number: int) -> dict[str, Any]:
+    """What a visit came to, as `refield visits --json` and `refield update --json` tell it."""
+    folder = workspace.visit(number)
+    change, report = workspace.change(number, masks=False), folder / "report.json"
     facts = read_json(report) if report.is_file() else {}
+    unclear = not change.objects and bool(read_json(folder / CHANGE).get("unexplained"))
     return {
         "visit": number,
         "made": facts.get("made"),
@@ -51,8 +52,9 @@ def _visit(workspace: Workspace, number: int) -> dict[str, Any]:
         "photos_rejected": len(change.photos) - len(change.frames),
         "seconds": round(sum(s for s in facts.get("seconds", {}).values() if s), 1),
         "changed": bool(changed_visits(workspace, number)[-1:] == [number]),
-        "why": _why(change),
-        "report": str(workspace.visit(number) / "report.html"),
+        "not_understood": unclear,
+        "why": _why(change, unclear),
+        "report": str(folder / "report.html"),
     }
 
 
@@ -68,10 +70,11 @@ def _told(o: ObjectChange) -> dict[str, Any]:
     }
 
 
-def _why(change: SceneChange) -> str:
+def _why(change: SceneChange, unclear: bool) -> str:
     if change.objects:
         return ""
-    return change.why or ("something changed that is not understood" if change.unexplained else "nothing changed")
+    what = "something changed that is not understood" if unclear else "nothing changed"
+    return f"{what}: {change.why}" if change.why else what
 
 
 def _table(visits: list[dict[str, Any]]) -> Table:

@@ -66,7 +66,7 @@ class AssociateConfig:
     arrived: float = 0.5
     """part of a newcomer's pixels that nothing else explains"""
     newcomer: float = 0.01
-    """part of a photo that something new must fill in at least one of them (the paper's contour area, §10.2.2)"""
+    """part of a photo that something new must fill in at least one of them"""  # the paper's contour area, §10.2.2
     crumb: float = 0.003
     """part of a photo that an object which was overlooked at first must fill in at least one of them"""
     trim: float = 0.03

@@ -60,7 +60,7 @@ class EstimateConfig:
     """refinement of poses through the field"""
     associate: AssociateConfig = field(default_factory=AssociateConfig)
     """what is believed"""
-    route: Literal["refield", "paper"] = "refield"
+    route: Literal["refield", "paper"] = field(default="refield", metadata={"usual": True})
     """the steps of this tool, or those of the paper as it gives them; the settings above are the former's"""
     paper: PaperConfig = field(default_factory=PaperConfig)
     """the paper's route"""

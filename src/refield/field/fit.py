@@ -29,12 +29,16 @@ from refield.scene.errors import InputError
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Pre-training (§10.1.1)."""
+    """Pre-training."""  # §10.1.1
 
     steps: int = 2000
     """of gradient descent"""
-    max_seconds: float | None = None
+    max_seconds: float | None = field(default=None, metadata={"usual": True})
     """stop in time: the learning rate follows whichever of steps and seconds is further on; compiling is not counted"""
+    photo_memory: float | None = field(default=None, metadata={"usual": True})
+    """GB for the photos' pixels; of more than fit, a part is kept, drawn from every photo alike"""
+    device: Literal["cpu", "cuda"] = field(default="cpu", metadata={"usual": True})
+    """where the fit runs; the field comes back to the CPU. The CUDA path was tested in an interpreter, not on a GPU"""
     samples: int = 8192
     """a step; the rays follow from how many samples each needs, and behind the first surface it needs none"""
     samples_per_ray: float = 40
@@ -46,7 +50,7 @@ class FitConfig:
     distortion: float = 1e-2
     """weight of the distortion loss; without it fog fills the grid"""
     gradient_unit: float = 1.0
-    """gradient scaling reaches 1 at this many core radii from the camera (§10.1)"""
+    """gradient scaling reaches 1 at this many core radii from the camera"""  # §10.1
     photos: PhotoModelConfig = field(default_factory=PhotoModelConfig)
     """what is found out about the photos, beside the field"""
     size: PhotoSizeConfig = field(default_factory=PhotoSizeConfig)
@@ -68,10 +72,6 @@ class FitConfig:
     least_gain: float = 0.02
     """dB"""
     seed: int = 0
-    photo_memory: float | None = None
-    """GB for the photos' pixels; of more than fit, a part is kept, drawn from every photo alike"""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """where the fit runs; the field comes back to the CPU. The CUDA path was tested in an interpreter, not on a GPU"""
 
 
 @dataclass(frozen=True)

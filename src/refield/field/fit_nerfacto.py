@@ -29,7 +29,7 @@ from refield.scene.capture import Capture, Rays
 
 @dataclass(frozen=True)
 class NerfactoFitConfig:
-    """Pre-training of the NeRFacto shape (§10.1.1); the numbers are nerfstudio's, but for the background."""
+    """Pre-training of the NeRFacto shape; the numbers are nerfstudio's, but for the background."""  # §10.1.1
 
     steps: int = 30_000
     """of gradient descent"""
@@ -48,7 +48,7 @@ class NerfactoFitConfig:
     distortion: float = 2e-3
     """weight of the distortion loss"""
     gradient_unit: float = 1.0
-    """gradient scaling reaches 1 at this many core radii from the camera (§10.1); 0 turns it off"""
+    """gradient scaling reaches 1 at this many core radii from the camera; 0 turns it off"""  # §10.1
     anneal_slope: float = 10.0
     """how steeply the proposals come to be trusted"""
     anneal_steps: int = 1000

@@ -4,7 +4,7 @@ which parts of it show what no other photo does. All of it stands beside the fie
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -34,12 +34,12 @@ _MOVING = 4  # every so-many-th ray tells how poses are wrong
 class PhotoModelConfig:
     """What a fit finds out about its photos."""
 
-    exposures: bool | None = None
+    exposures: bool | None = field(default=None, metadata={"usual": True})
     """exposure and white balance of each photo, vignetting of each camera, where they differ; by default as the quality
     says, and not without one"""
-    poses: bool = False
+    poses: bool = field(default=False, metadata={"usual": True})
     """where each photo was taken and what its lens is, a few pixels around what is given"""
-    trust: bool = False
+    trust: bool = field(default=False, metadata={"usual": True})
     """parts of single photos that show what no other does count for less"""
 
 

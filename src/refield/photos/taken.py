@@ -11,7 +11,7 @@ import importlib.util
 import io
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,7 @@ _AS_THEY_ARE = (".jpg", ".jpeg", ".png")
 class PhotoConfig:
     """How photos without poses are taken in."""
 
-    longest: int = 1600
+    longest: int = field(default=1600, metadata={"usual": True})
     """pixels of the longer side; larger photos are scaled down to it"""
     video_frames: int = 120
     """taken from a video: the sharpest, spread over its length"""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class InputError(Exception):
     """Input that cannot be used. Shown as one line; the command line ends with exit code 2."""
@@ -9,3 +12,15 @@ class InputError(Exception):
     def __init__(self, where: object, what: str, remedy: str) -> None:
         self.where, self.what, self.remedy = str(where), what, remedy
         super().__init__(f"{where}: {what}; {remedy}")
+
+
+def did_you_mean(given: str, known: Iterable[str]) -> str:
+    """``did you mean 'update'? `` where something known is nearly that (a file's name also without its folders and its
+    ending), else nothing."""
+    folded: dict[str, str] = {}
+    for name in known:
+        short = name.rpartition("/")[2]
+        for form in (short.partition(".")[0], short, name):  # the last one counts where two are alike
+            folded[form.lower()] = name
+    near = difflib.get_close_matches(given.lower(), folded, n=1, cutoff=0.6)
+    return f"did you mean {folded[near[0]]!r}? " if near else ""

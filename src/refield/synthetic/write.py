@@ -20,7 +20,7 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import ObjectChange, PlacedPhoto, SceneChange
 from refield.scene.change_files import save_change
-from refield.scene.errors import InputError
+from refield.scene.errors import InputError, did_you_mean
 from refield.scene.images import write_image
 from refield.scene.transforms_json import save_transforms
 from refield.synthetic.cameras import hemisphere, ring, square_camera
@@ -46,7 +46,7 @@ class SynthConfig:
     spp: int = 64
     """light paths a pixel"""
     cameras: int | None = None
-    """of the old photos, on 10 heights; 180 if not given (§11.1). Not for the world random"""
+    """of the old photos, on 10 heights; 180 if not given. Not for the world random"""  # §11.1
     photos: int | None = None
     """old photos of the world random; if not given, as many as its seed says: 30 to 120, from 2000 on 20 to 300"""
     path: Literal["orbit", "half orbit", "hand-held", "dome", "forward", "inside-out", "walk"] | None = None
@@ -79,7 +79,10 @@ def write_world(
         InputError: there is no such world, a number is out of range, or Mitsuba is not installed.
     """
     if name not in WORLDS:
-        raise InputError(f"world {name!r}", "there is no such world", f"choose one of random, {', '.join(WORLDS)}")
+        near = did_you_mean(name, ["random", *WORLDS])
+        raise InputError(
+            f"world {name!r}", "there is no such world", f"{near}choose one of random, {', '.join(WORLDS)}"
+        )
     world = WORLDS[name](seed)
     photograph(world, out, SynthConfig(size, spp, cameras, seed=seed), on_progress)
     return world

@@ -10,16 +10,16 @@ class UpdateConfig:
     """How the helper is trained and shown."""
 
     dilation: float = 1.5
-    """The helper trains and is shown in each object's grid, its box this many times as large. §10.1.3 says 2 to 3; but
-    with the carved object known to be empty and the light set right the old field knows the surroundings better."""
+    """The helper trains and is shown in each object's grid, its box this many times as large. The paper says 2 to 3;
+    but with the carved object known to be empty and the light set right the old field knows the surroundings better."""
     ground: float = 2.0
     """The ground that objects stood on gets the texture that the new photos show, within each object's grid at its old
-    and its new place, its box this many times as large (§10.1.3: 2 to 3). When the object moves on, what lies within
+    and its new place, its box this many times as large (the paper: 2 to 3). When the object moves on, what lies within
     `composite.DILATION` times its box is forgotten."""
     shadow: float = 0.01
-    """Old photos: pixels this near to an object's mask, in image widths, may hold its shadow (§10.1.3)."""
+    """Old photos: pixels this near to an object's mask, in image widths, may hold its shadow."""  # §10.1.3
     far: float = 0.15
-    """Old photos: pixels further away than this, in image widths, do not teach (§10.1.3)."""
+    """Old photos: pixels further away than this, in image widths, do not teach."""  # §10.1.3
     relight: bool = True
     """Fit how the light on unchanged surfaces changed."""
     steps: int = 200
@@ -35,7 +35,7 @@ class UpdateConfig:
     distortion: float = 1e-2
     """weight of the distortion loss"""
     gradient_unit: float = 1.0
-    """gradient scaling reaches 1 at this many core radii of the old field from the camera (§10.1)"""
+    """gradient scaling reaches 1 at this many core radii of the old field from the camera"""  # §10.1
     emptiness: float = 5e-2
     """weight of the colour that comes from where nothing can be: deep inside what left, where nothing was before and,
     half as much, beneath the ground that it stood on and above that in its rim and right beside it"""

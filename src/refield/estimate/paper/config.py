@@ -24,12 +24,12 @@ class PaperConfig:
     alike: float = 0.5
     """cosine similarity of pooled features below which masks before and after are of two objects"""
     detect: DetectConfig = field(default_factory=DetectConfig)
-    """change masks (§10.2.2)"""
+    """change masks"""  # §10.2.2
     pose: PoseConfig = field(default_factory=PoseConfig)
-    """pose change from features (§9.2)"""
+    """pose change from features"""  # §9.2
     refine: RefineConfig = field(default_factory=RefineConfig)
-    """its refinement through the field (§9.3)"""
+    """its refinement through the field"""  # §9.3
     segment: SegmentConfig = field(default_factory=SegmentConfig)
-    """the object in 3-D and on the old photos (§10.2.4)"""
+    """the object in 3-D and on the old photos"""  # §10.2.4
     hull: HullConfig = field(default_factory=lambda: HullConfig(longest=100))
     """the carving of newcomers, which the paper does not have"""

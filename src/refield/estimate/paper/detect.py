@@ -30,7 +30,7 @@ Box = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DetectConfig:
-    """How photos are compared with the old field (§10.2.2)."""
+    """How photos are compared with the old field."""  # §10.2.2
 
     align: AlignConfig = field(default_factory=AlignConfig)
     """of renders to photos"""
@@ -43,7 +43,7 @@ class DetectConfig:
     floor: float = 1.5
     """a change differs by more than this many times the level at which no old photo would show one"""
     merged: float = 1.5
-    """a contour this many times as large as the view's others may be two that overlap (Fig. 13)"""
+    """a contour this many times as large as the view's others may be two that overlap"""  # Fig. 13
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from refield.vision import pixels
 
 @dataclass(frozen=True)
 class RefineConfig:
-    """Adam on δT (§10.2.3)."""
+    """Adam on δT."""  # §10.2.3
 
     rate: float = 0.001
     """learning rate; radians, and world units in which the paper's scenes are about 2 wide"""

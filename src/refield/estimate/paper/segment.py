@@ -29,14 +29,14 @@ _CHUNK = 200_000  # nodes projected at once
 
 @dataclass(frozen=True)
 class SegmentConfig:
-    """How an object is cut out (§10.2.4)."""
+    """How an object is cut out."""  # §10.2.4
 
     nearest: float = 0.95
     """of the cloud's points, those nearest to its centroid, are believed"""
     box: float = 1.05
     """size of the box that is asked about, against the projected cloud's"""
     confidence: float = 0.95
-    """of the segmenter (SAM's scale); an old photo with less is left out (§10.1.3)"""
+    """of the segmenter (SAM's scale); an old photo with less is left out"""  # §10.1.3
     expanded: float = 3.0
     """size of the grid's box, against the cloud's"""
     nodes: int = 100
