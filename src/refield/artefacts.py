@@ -95,6 +95,19 @@ def part_folder(base: Path) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
 
 
+def need_writable(path: Path) -> None:
+    """Check that a file or folder can be made, or replaced, at ``path``.
+
+    Raises:
+        InputError: the folder that it would lie in, or the first above it that is there, cannot be written.
+    """
+    there = next(p for p in (path, *path.parents) if p.is_dir() or (p != path and p.exists()))
+    if not there.is_dir():
+        raise InputError(path, f"cannot be made: {there} is a file, not a folder", "choose another place")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise InputError(path, f"cannot be written: {there} allows no writing", "check permissions, or choose another")
+
+
 def need_space(folder: Path, size: int) -> None:
     """Check that ``size`` bytes fit on the disk, with some to spare.
 

@@ -22,6 +22,7 @@ from refield.artefacts import (
     PART,
     locked,
     need_space,
+    need_writable,
     part_folder,
     read_tensors,
     sync,
@@ -52,12 +53,13 @@ _OURS = (MARKER, "capture", "field", "visits")
 
 
 def refuse_inside(*paths: Path) -> None:
-    """Check that none of ``paths``, where the user wants something written, is what a workspace keeps or lies in it.
+    """Check that ``paths``, where the user wants something written, can be written, and that none of them is what a
+    workspace keeps or lies in it.
 
     A name of the user's own beside a workspace's entries is free. Links are followed.
 
     Raises:
-        InputError: one is.
+        InputError: one cannot, or is.
     """
     for path in paths:
         try:
@@ -70,6 +72,7 @@ def refuse_inside(*paths: Path) -> None:
             if _is_kept(name) and _is_workspace(root):
                 what = f"belongs to the workspace {root}: nothing but refield's own steps writes there"
                 raise InputError(path, what, "choose another place, outside of what a workspace keeps")
+        need_writable(place)
 
 
 class Workspace:

@@ -1,9 +1,12 @@
 """`refield rehearse`: what is done is told whatever comes after it."""
 
+import json
+
 import pytest
 import torch
 
 from refield.commands import rehearse
+from refield.commands.answer import told
 from refield.commands.rehearse import Rehearse, Rehearsed
 from refield.field.fit import FitConfig
 from refield.rehearse.plan import NoRoomError
@@ -17,7 +20,7 @@ FACTS = {"happening": "nothing", "changes": []}
 def run(tmp_path, monkeypatch):
     """Runs the command; rehearsals take no time, and those of which an outcome is given end in it."""
 
-    def go(seeds, outcomes):
+    def go(seeds, outcomes, as_json=False):
         def rehearsed(scenery, folder, seed, clock, options):
             folder.mkdir()
             if seed in outcomes:
@@ -27,7 +30,8 @@ def run(tmp_path, monkeypatch):
 
         monkeypatch.setattr(rehearse, "prepared", lambda *_: (None, 1.0))
         monkeypatch.setattr(rehearse, "rehearsed", rehearsed)
-        rehearse.run(Rehearse(tmp_path / "work", seeds, tmp_path / "out", fit=FitConfig()))
+        asked = Rehearse(tmp_path / "work", seeds, tmp_path / "out", fit=FitConfig())
+        told(lambda: rehearse.run(asked), as_json=as_json)
 
     return go
 
@@ -52,3 +56,10 @@ def test_what_is_done_is_told_when_it_is_interrupted(run, tmp_path, capsys, faul
         run("0..2", {1: fault})
     assert "1 of 1 rehearsals" in capsys.readouterr().out
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["000", rehearse.REPORT]
+
+
+def test_programs_are_told_what_is_done_and_why_there_is_no_more(run, capsys):
+    with pytest.raises(KeyboardInterrupt):
+        run("0..2", {1: KeyboardInterrupt()}, as_json=True)
+    document = json.loads(capsys.readouterr().out)
+    assert [r["seed"] for r in document["rehearsals"]] == [0] and document["error"]["what"] == "interrupted"

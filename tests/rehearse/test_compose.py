@@ -9,6 +9,7 @@ import torch
 
 from refield.cli import main
 from refield.commands import rehearse
+from refield.commands.answer import told
 from refield.field.fit import FitConfig
 from refield.field.render import render_camera
 from refield.rehearse.compose import compose, divided, scenery_of
@@ -152,7 +153,8 @@ def test_a_rehearsal_from_photos_to_numbers(scenery, tmp_path, capsys, monkeypat
     """All of it, with a training so short that nothing is found."""
     monkeypatch.setattr(rehearse, "prepared", lambda *_: (scenery, 1.0))
     out = tmp_path / "out"
-    rehearse.run(rehearse.Rehearse(tmp_path / "work", "1", out, fit=FitConfig(steps=40)))
+    asked = rehearse.Rehearse(tmp_path / "work", "1", out, fit=FitConfig(steps=40))
+    told(lambda: rehearse.run(asked), as_json=False)
     (one,) = read_json(out / rehearse.REPORT)["rehearsals"]
     assert one["facts"]["happening"] == "added" and [o["kind"] for o in one["change"]["objects"]] == ["added"]
     assert one["held_out_psnr"] > 10 and one["evaluation"]["pooled"]["psnr_in"] > 5 and one["refused"] == ""

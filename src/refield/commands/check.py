@@ -44,7 +44,7 @@ class Check:
     """photos without poses: how they are taken in, and how their poses are found"""
     quality: Quality = "good"
     """of the fit, for its memory and time"""
-    fit: FitConfig = OPEN
+    fit: FitConfig = field(default=OPEN, metadata={"usual": False})
     """what would be fitted"""
     output: OmitArgPrefixes[Output] = PLAIN
 

@@ -7,7 +7,7 @@ import math
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Protocol
 
 from rich.console import Console
@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from refield.field.fit import FitProgress
 
 _WIDE = 120
+_TELLING = 0.1  # of all that is expected: the stages before tell how fast it goes
 _QUIET_SECONDS = 5.0  # without a terminal a progress line appears this often
 
 
@@ -37,6 +38,8 @@ class Clock:
         self.seconds: dict[str, float] = {}
         self.warnings: list[str] = []
         self._stage: str | None = None
+        self._expected: dict[str, float] = {}
+        self._sure = 0.0
         self._since = self._began = time.perf_counter()
 
     @property
@@ -52,7 +55,28 @@ class Clock:
         """A stage begins; the one before it ends. The ``on_stage`` of every recipe."""
         self._close()
         self._stage = name
-        self.console.print(f"[{self.total:6.1f} s] {name}", markup=False)
+        left = self._left(name)
+        more = "" if left is None else f" (about {duration(left)} left)"
+        self.console.print(f"[{self.total:6.1f} s] {name}{more}", markup=False)
+
+    def expect(self, seconds: Mapping[str, float], *, sure: float = 0.0) -> None:
+        """How long the stages to come took another time, in their order: each then tells how long is left in all.
+
+        ``sure``: seconds of this command that count as much as what was expected of it; 0 where the other time was
+        another scene's, and only the stages' shares are alike.
+        """
+        self._expected, self._sure = dict(seconds), sure
+
+    def _left(self, stage: str) -> float | None:
+        """Seconds, about; None where nobody knows."""
+        if stage not in self._expected:
+            return None
+        names = list(self._expected)
+        done = [name for name in names[: names.index(stage)] if name in self.seconds]
+        expected = sum(self._expected[name] for name in done) + self._sure
+        taken = sum(self.seconds[name] for name in done) + self._sure
+        left = sum(self._expected[name] for name in names[names.index(stage) :])
+        return left * taken / expected if expected >= _TELLING * (left + expected) else None
 
     def stop(self) -> None:
         """The last stage ends."""

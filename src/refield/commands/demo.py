@@ -34,7 +34,7 @@ class Demo:
 
     out: Annotated[Path, arg(metavar="OUT"), Positional] = Path("refield-demo")
     """the workspace to make; one that an earlier demo made is replaced"""
-    fit: FitConfig = field(default_factory=FitConfig)
+    fit: FitConfig = field(default_factory=FitConfig, metadata={"usual": False})
     output: OmitArgPrefixes[Output] = PLAIN
 
 

@@ -8,7 +8,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,7 +23,7 @@ from refield.commands.options import PLAIN, Output
 from refield.commands.train import Sources, train
 from refield.commands.update import Update, Visit, update
 from refield.evaluate import Report
-from refield.field.fit import FitConfig
+from refield.field.fit import FitConfig, need_device
 from refield.field.quality import OPEN, Quality
 from refield.rehearse.compose import Scenery, compose, divided, scenery_of
 from refield.rehearse.plan import NoRoomError
@@ -59,7 +59,7 @@ class Rehearse:
     """the new photos come with their poses; --no-placed has them placed by what they show, as photos of your own are"""
     quality: Quality = "draft"
     """of the rehearsed fits, as `refield train` has it"""
-    fit: FitConfig = OPEN
+    fit: FitConfig = field(default=OPEN, metadata={"usual": False})
     output: OmitArgPrefixes[Output] = PLAIN
 
 
@@ -93,6 +93,7 @@ def run(options: Rehearse) -> Answer:
     seeds, clock = seeds_of(options.seeds), Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     if options.out is not None:
         _refuse_unless_free(options.work, options.out)
+    need_device(options.fit.device)
     scenery, size = prepared(options.work, clock, (options.fit, options.quality), len(seeds))
     done: list[Rehearsed] = []
     stop: BaseException | None = None

@@ -13,7 +13,7 @@ from refield.commands.answer import Answer
 from refield.commands.clock import Clock
 from refield.commands.options import PLAIN, Output
 from refield.field.descent import NonFiniteError
-from refield.field.fit import FitConfig, ProgressCallback, fit_capture
+from refield.field.fit import FitConfig, ProgressCallback, fit_capture, need_device
 from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig, fit_nerfacto
 from refield.field.memory import Memory, memory_fault, memory_of
 from refield.field.nerfacto import NerfactoField
@@ -121,6 +121,7 @@ def train(
             memory.
     """
     Workspace.refuse_unless_free(task.work, overwrite=overwrite)
+    need_device(config.device if isinstance(config, FitConfig) else "cpu")
     capture, landmarks = _loaded(task, clock)
     if quality is not None and isinstance(config, FitConfig):
         config = sized(config, capture.train, quality)

@@ -22,13 +22,14 @@ from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.evaluate import Report, evaluate, looked_over
 from refield.field.radiance import Field
 from refield.field.render import render_camera
-from refield.history import known_objects, retouched, state
+from refield.history import changed_visits, known_objects, retouched, state
 from refield.photos.sources import find_sources
 from refield.photos.taken import PhotoConfig
 from refield.report import summary, write_contact_sheet, write_report
 from refield.scene.capture import Capture
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
+from refield.scene.files import read_json
 from refield.scene.load import is_posed, load_new_photos
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
@@ -39,6 +40,12 @@ from refield.workspace import Workspace
 SHOWN = 256 * 256
 """pixels, about and at most, of what a field shows of a new photo on the page"""
 SHEET = "before-after.png"
+_USUAL = {
+    "detect": 3.6, "hull": 1.3, "pose": 5.2, "segment": 0.4, "move": 1.2, "light": 2.8, "supervise": 4.0,
+    "freeze": 2.3, "train": 3.4, "show": 1.0, "report": 3.4,
+}  # fmt: skip
+"""seconds that the stages of the demo's update take on two cores"""
+_SURE = 10.0  # seconds
 EXAMPLES = (
     "refield update work after",
     "refield update work after --exit-code --json > change.json",
@@ -86,6 +93,7 @@ class Visit:
 
 def run(options: Update) -> Answer:
     clock = Clock(quiet=options.output.quiet, verbose=options.output.verbose)
+    _expect(Workspace.open(options.work), clock)
     visit = update(options, clock)
     change = visit.change
     unclear = change.objects or change.unexplained
@@ -93,6 +101,17 @@ def run(options: Update) -> Answer:
     code = Exit.CHANGED if change.objects else Exit.UNCLEAR if change.unexplained else Exit.DONE
     document = facts_of(options.work, visit) | {"warnings": clock.warnings, "seconds_per_stage": clock.seconds}
     return Answer(document, [line for line in words if line], code if options.exit_code else Exit.DONE)
+
+
+def _expect(workspace: Workspace, clock: Clock) -> None:
+    """As long as the workspace's last visit that changed something; without one the stages' shares are the usual."""
+    for number in reversed(changed_visits(workspace, workspace.visits)):
+        report = workspace.visit(number) / "report.json"
+        taken = read_json(report).get("seconds", {}) if report.is_file() else {}
+        if isinstance(taken, dict) and _USUAL.keys() <= taken.keys():
+            stages = {name: float(taken[name] or 0) for name in ("localize", *_USUAL) if name in taken}
+            return clock.expect(stages, sure=_SURE)
+    clock.expect(_USUAL)
 
 
 def facts_of(work: Path, visit: Visit) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from refield.field.fit import need_device
 from refield.scene.errors import InputError
 from refield.vision.describer import Describer
 from refield.vision.matcher import Matcher, SiftMatcher
@@ -52,6 +53,8 @@ class ModelConfig:
         if (self.segmenter, self.matcher, self.describer) == ("grabcut", "sift", "vlad"):
             return Models()
         from refield.vision.weights import DESCRIBERS, MATCHERS, SEGMENTERS, WeightsError
+
+        need_device(self.device)
 
         def folder(kind: str, name: str, given: Path | None) -> Path:
             if given is None:

@@ -61,7 +61,7 @@ class EstimateConfig:
     associate: AssociateConfig = field(default_factory=AssociateConfig)
     """what is believed"""
     route: Literal["refield", "paper"] = field(default="refield", metadata={"usual": True})
-    """the steps of this tool, or those of the paper as it gives them; the settings above are the former's"""
+    """refield's own steps, or those of the paper as it gives them (``estimate.paper``)"""
     paper: PaperConfig = field(default_factory=PaperConfig)
     """the paper's route"""
     models: ModelConfig = field(default_factory=ModelConfig)

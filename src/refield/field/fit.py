@@ -213,11 +213,16 @@ def _fit_on_gpu(
     on_progress: ProgressCallback | None,
     on_step: StepCallback | None,
 ) -> None:
-    if not torch.cuda.is_available():
-        raise InputError("device cuda", "torch finds no CUDA GPU on this machine", "leave the option out")
+    need_device(config.device)
     from refield.field.gpu_fit import fit_on_gpu
 
     fit_on_gpu(model, photos, config, on_progress, on_step)
+
+
+def need_device(device: str) -> None:
+    """Raises InputError: it is not there."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("device cuda", "torch finds no CUDA GPU on this machine", "leave the option out")
 
 
 def most_pixels(config: FitConfig) -> int | None:

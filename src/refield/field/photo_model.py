@@ -39,7 +39,7 @@ class PhotoModelConfig:
     says, and not without one"""
     poses: bool = field(default=False, metadata={"usual": True})
     """where each photo was taken and what its lens is, a few pixels around what is given"""
-    trust: bool = field(default=False, metadata={"usual": True})
+    trust: bool = False
     """parts of single photos that show what no other does count for less"""
 
 
