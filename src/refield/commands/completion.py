@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -76,7 +77,10 @@ def script(shell: Literal["bash", "zsh", "fish"]) -> str:
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
         subcommand_cli_from_dict(kinds, prog="refield", args=["--tyro-print-completion", shell])
-    text = said.getvalue()
+    # what is said of an option has to stay on its line
+    text = re.sub(
+        r"^.*COMPLETION_SPEC = .*$", lambda m: re.sub(r"\\+n", " ", m[0]), said.getvalue(), flags=re.MULTILINE
+    )
     return _zsh(text) if shell == "zsh" else text + _FILES_TOO[shell]
 
 
