@@ -25,7 +25,7 @@ from tests.conftest import HERE, TINY_FIT
 from tests.test_cli import FEW, believing, place, update  # noqa: F401
 
 OPTION = re.compile(r"--[a-z][\w.-]*")
-LONGEST = 75  # lines of a short help, on a terminal of 80 columns
+LONGEST = 80  # lines of a short help, on a terminal of 80 columns
 
 
 def help_of(command, option="--help"):

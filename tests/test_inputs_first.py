@@ -1,5 +1,6 @@
 """Inputs are looked at before heavy work begins: whoever is refused has waited for nothing, and nothing is left."""
 
+import os
 import shutil
 
 import pytest
@@ -62,6 +63,18 @@ ROWS = [
     (["rehearse", "work", "--out", "a/b/out"], "the capture", "a rehearsal needs 20 or more"),
     (["synth", "random", "a/b/out", "--into", "work"], "the capture", "a rehearsal needs 20 or more"),
     (["synth", "random", "out", "--into", "work", "--cameras", "40"], "--cameras", "give --photos"),
+    (["train", "data", "notes/readme.txt/out"], "notes/readme.txt/out", "is a file, not a folder"),
+    (["demo", "notes/readme.txt/out"], "notes/readme.txt/out", "is a file, not a folder"),
+    (["check", "data", "--picture", "notes/readme.txt/a.png"], "notes/readme.txt/a.png", "is a file, not a folder"),
+    (["check", "photos", "--work", "notes/readme.txt/a"], "notes/readme.txt/a", "is a file, not a folder"),
+    (["evaluate", "work", "new", "--out", "notes/readme.txt/a.json"], "notes/readme.txt/a.json", "is a file"),
+    (
+        ["render", "work", "--cameras", "new/transforms.json", "--out", "notes/readme.txt/a"],
+        "notes/readme.txt/a",
+        "file",
+    ),
+    (["rehearse", "work", "--out", "notes/readme.txt/a/b"], "notes/readme.txt/a/b", "is a file, not a folder"),
+    (["synth", "cube", "notes/readme.txt/a"], "notes/readme.txt/a", "is a file, not a folder"),
 ]
 
 
@@ -73,6 +86,22 @@ def test_inputs_are_looked_at_first(place, capsys, argv, names, says):
     assert message.startswith(f"refield: {names}") and says in message and ";" in message, message
     assert contents(place) == before
     assert not (place / "out").exists() and not (place / "a").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize("argv", [["train", "data", "out"], ["rehearse", "work"]])
+def test_a_gpu_that_is_not_there_is_missed_first(place, capsys, argv):
+    assert main([*argv, "--fit.device", "cuda"]) == 2
+    assert capsys.readouterr().err == (
+        "refield: device cuda: torch finds no CUDA GPU on this machine; leave the option out\n"
+    )
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_place_that_allows_no_writing_is_refused_first(place, capsys):
+    (place / "bare").chmod(0o500)
+    assert main(["train", "data", "bare/out"]) == 2
+    assert "bare allows no writing" in capsys.readouterr().err
 
 
 def test_too_few_photos_leave_nothing(place, capsys):

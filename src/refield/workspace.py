@@ -72,7 +72,7 @@ def refuse_inside(*paths: Path) -> None:
             if _is_kept(name) and _is_workspace(root):
                 what = f"belongs to the workspace {root}: nothing but refield's own steps writes there"
                 raise InputError(path, what, "choose another place, outside of what a workspace keeps")
-        need_writable(place)
+        need_writable(path)
 
 
 class Workspace:

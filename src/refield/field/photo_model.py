@@ -34,7 +34,7 @@ _MOVING = 4  # every so-many-th ray tells how poses are wrong
 class PhotoModelConfig:
     """What a fit finds out about its photos."""
 
-    exposures: bool | None = field(default=None, metadata={"usual": True})
+    exposures: bool | None = None
     """exposure and white balance of each photo, vignetting of each camera, where they differ; by default as the quality
     says, and not without one"""
     poses: bool = field(default=False, metadata={"usual": True})
