@@ -272,3 +272,13 @@ def test_other_shells_can_read_theirs(tmp_path, shell):
     if program := shutil.which(shell):
         (tmp_path / "script").write_text(text)
         subprocess.run([program, "-n", str(tmp_path / "script")], check=True)
+
+
+def test_doctor_opens_weights(tmp_path, capsys):
+    transformers = pytest.importorskip("transformers", reason="the extra 'sam' is not installed")
+    sizes = {"hidden_size": 24, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 28, "patch_size": 14}
+    model = transformers.Dinov2Model(transformers.Dinov2Config(**sizes))
+    model.save_pretrained(tmp_path)
+    capsys.readouterr()
+    weights = told(capsys, "doctor", "--weights", str(tmp_path))["weights"]
+    assert weights["model"] == "dinov2" and weights["parameters"] == sum(p.numel() for p in model.parameters())
