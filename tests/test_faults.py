@@ -187,7 +187,7 @@ ROWS: dict[str, tuple[list[str], Callable[[Path], object], str]] = {
     "unknown command": (
         ["trian", "data", "out"],
         nothing,
-        r"'trian' is no command; choose one of demo, check, train",
+        r"'trian' is no command; did you mean 'train'\? choose one of demo, check, train",
     ),
     "unknown world": (["synth", "moon", "out"], nothing, r"no such world; choose one of"),
 }
