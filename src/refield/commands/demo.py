@@ -13,13 +13,14 @@ from tyro.conf import Positional, arg
 from refield.commands.clock import Clock, results
 from refield.commands.evaluate import table
 from refield.commands.train import Sources, train
-from refield.commands.update import Update, Visit, update
+from refield.commands.update import Update, update
 from refield.evaluate import pose_error
 from refield.field.fit import FitConfig
 from refield.report import summary
 from refield.scene.change import SceneChange
 from refield.scene.change_files import load_change
 from refield.synthetic import sample_folder
+from refield.visits.visit import Visit
 from refield.workspace import Workspace
 
 

@@ -19,7 +19,7 @@ from refield.artefacts import writable
 from refield.check.survey import survey_capture
 from refield.commands.clock import Clock, results
 from refield.commands.train import Sources, train
-from refield.commands.update import Update, Visit, update
+from refield.commands.update import Update, update
 from refield.evaluate import Report
 from refield.field.fit import FitConfig
 from refield.field.quality import OPEN, Quality
@@ -30,6 +30,7 @@ from refield.scene.change_files import load_change
 from refield.scene.errors import InputError
 from refield.scene.files import read_json, write_json
 from refield.scene.world import world_of
+from refield.visits.visit import Visit
 from refield.workspace import Workspace, refuse_inside
 
 REPORT = "rehearsals.json"

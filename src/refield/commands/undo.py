@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from refield.scene.errors import InputError
+from refield.visits.make import take_back
 from refield.workspace import Workspace
 
 
@@ -21,11 +21,5 @@ class Undo:
 
 
 def run(options: Undo) -> None:
-    workspace = Workspace.open(options.work)
-    with workspace.writing():
-        number = workspace.visits
-        if number == 0:
-            what = "has had no visit, so there is nothing to take back"
-            raise InputError(options.work, what, f"make one with: refield update {options.work} PHOTOS")
-        workspace.drop_last_visit()
+    number = take_back(Workspace.open(options.work))
     print(f"visit {number} is taken back; {options.work} is as it was after visit {number - 1}")

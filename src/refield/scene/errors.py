@@ -9,3 +9,21 @@ class InputError(Exception):
     def __init__(self, where: object, what: str, remedy: str) -> None:
         self.where, self.what, self.remedy = str(where), what, remedy
         super().__init__(f"{where}: {what}; {remedy}")
+
+
+def expect(what: str, value: object, kinds: type | tuple[type, ...], give: str) -> None:
+    """Check a caller's argument, which ``what`` names.
+
+    Raises:
+        TypeError: it is of none of the ``kinds``; the sentence ends with ``give``.
+    """
+    if not isinstance(value, kinds):
+        raise wrong(what, value, give)
+
+
+def wrong(what: str, value: object, give: str) -> TypeError:
+    """A caller's argument is not of its type: a sentence that says what came, and what to give."""
+    itself = f" ({value!r})" if isinstance(value, str | int | float) and len(repr(value)) < 60 else ""
+    name = type(value).__name__
+    came = "None" if value is None else f"{'an' if name[0] in 'aeiouAEIOU' else 'a'} {name}{itself}"
+    return TypeError(f"{what} is {came}; give {give}")
