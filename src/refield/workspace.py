@@ -193,6 +193,7 @@ class Workspace:
     @staticmethod
     def made_by(path: AnyPath) -> str | None:
         """The command that made the workspace at ``path``; None if there is none."""
+        path = as_path(path, "the workspace")
         return read_json(path / MARKER).get("made_by") if (path / MARKER).is_file() else None
 
     def keep_capture(self, capture: Capture) -> Capture:

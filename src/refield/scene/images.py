@@ -145,16 +145,21 @@ def write_image(path: AnyPath, image: Tensor) -> None:
     expect("the picture", image, Tensor, shown)
     if image.dim() != 2 and (image.dim() != 3 or image.shape[-1] != 3):
         raise ValueError(f"{path}: a picture of the shape {tuple(image.shape)} cannot be written; give {shown}")
+    if image.is_floating_point() and not bool(image.isfinite().all()):
+        raise ValueError(f"{path}: the picture holds values that are not finite")
+    write_bytes(path, png(image), durable=False)
+
+
+def png(image: Tensor) -> bytes:
+    """A picture as `write_image` writes it."""
     image = image.detach().cpu()
     if image.is_floating_point():
-        if not bool(image.isfinite().all()):
-            raise ValueError(f"{path}: the picture holds values that are not finite")
         image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
     buffer = io.BytesIO()
     mark = PngImagePlugin.PngInfo()
     mark.add_text(*_MARK)
     Image.fromarray(image.numpy()).save(buffer, format="PNG", pnginfo=mark)
-    write_bytes(path, buffer.getvalue(), durable=False)
+    return buffer.getvalue()
 
 
 def is_ours(path: Path) -> bool:
