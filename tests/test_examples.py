@@ -1,5 +1,5 @@
 """What is shown in Python is run as it stands, scripts with their arguments and the README line by line, on a scene
-that is tiny: fits and trainings are small, and a fit that is asked for again is not made again."""
+that is tiny: the steps' settings are small, and what several ask for alike, a fit or an estimate, is made once."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ import torch
 
 import refield
 from refield.cli import main
+from refield.estimate import recipe
+from refield.estimate.hull import HullConfig
+from refield.estimate.outline import ObjectConfig
+from refield.estimate.pose_change import RefineConfig
+from refield.estimate.recipe import EstimateConfig
+from refield.estimate.register import RegisterConfig
 from refield.field import fit
 from refield.scene.images import read_image
 from refield.update.config import UpdateConfig
@@ -24,6 +30,12 @@ from tests.changed import FIT, FIT_OPTIONS, Changed, write_changed
 
 ROOT = Path(__file__).parent.parent
 FEW = UpdateConfig(steps=40)
+COARSE = EstimateConfig(
+    hull=HullConfig(longest=64),
+    objects=ObjectConfig(longest=48, rays=20000),
+    register=RegisterConfig(rotations=200, turns=24),
+    refine=RefineConfig(rays=(2000, 8000), detail_rays=8000),
+)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +44,8 @@ def changed(tmp_path_factory) -> Changed:
 
 
 @pytest.fixture(scope="module")
-def fits() -> dict:
+def known() -> dict:
+    """What was made, by what it was made from."""
     return {}
 
 
@@ -45,19 +58,31 @@ def work(changed, tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def small(monkeypatch, fits):
-    """Fits and trainings of few steps wherever the defaults are taken."""
-    whole = fit.fit_field
+def small(monkeypatch, known):
+    """Small settings wherever the defaults are taken."""
+    fit_field, estimate_change = fit.fit_field, recipe.estimate_change
 
     def fitted(capture, config=FIT, on_progress=None):
-        key = tuple(frame.path for frame in capture.frames)
-        if key not in fits:
-            fits[key] = whole(capture, FIT, on_progress)
-        return fits[key]
+        key = contents_of(capture.frames)
+        if key not in known:
+            known[key] = fit_field(capture, FIT, on_progress)
+        return known[key]
+
+    def estimated(capture, field, frames, config=COARSE, on_stage=None):
+        # the field is kept, so that no other gets its id
+        key = contents_of(capture.frames), id(field), contents_of(frames)
+        if key not in known:
+            known[key] = estimate_change(capture, field, frames, COARSE, on_stage), field
+        return known[key][0]
 
     monkeypatch.setattr(fit, "fit_field", fitted)
+    monkeypatch.setattr(recipe, "estimate_change", estimated)
     monkeypatch.setattr(update_field, "__defaults__", (FEW, None, None))
-    monkeypatch.setattr(opened.Scene.update, "__defaults__", (VisitConfig(update=FEW),))
+    monkeypatch.setattr(opened.Scene.update, "__defaults__", (VisitConfig(estimate=COARSE, update=FEW),))
+
+
+def contents_of(frames) -> tuple:
+    return tuple((frame.path.read_bytes() if frame.made is None else frame.path) for frame in frames)
 
 
 @pytest.fixture
