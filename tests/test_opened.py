@@ -238,8 +238,8 @@ def test_notebooks_show_captures_changes_and_fields(place, monkeypatch):
     html = change._repr_html_()
     assert pictures(html) == 3 and "blurred" in html and "<td" in html and "because" in html
     html = scene.field()._repr_html_()
-    assert pictures(html) == 2 and "moved 1, added 1" in html
-    assert repr(scene.field()).startswith("UpdatedField(moved 1, added 1; before: HashField(")
+    assert pictures(html) == 2 and "1 moved, 1 added" in html
+    assert repr(scene.field()).startswith("UpdatedField(1 moved, 1 added; before: HashField(")
     html = scene._repr_html_()
     assert (place / "work/visits/001/report.html").as_uri() in html and pictures(html) == 6
     assert visit.html.resolve().as_uri() in visit._repr_html_()

@@ -46,7 +46,8 @@ class OccupancySampler:
 
     def facts(self) -> list[tuple[str, object]]:
         """What to tell a person of it."""
-        at = ", ".join(f"{v:.4g}" for v in self.contraction.centre.tolist())
+        least = 1e-6 * self.contraction.radius
+        at = ", ".join(f"{v if abs(v) > least else 0:.4g}" for v in self.contraction.centre.tolist())
         full = 100 * float((self.grid > 0).float().mean())
         where = f"({at}), {self.contraction.radius:.4g} to each side"
         return [("core around", where), ("occupied", f"{full:.2g} % of {self.resolution}³ cells")]

@@ -164,7 +164,7 @@ class UpdatedField:
 
     @property
     def _changed_here(self) -> str:
-        return ", ".join(f"{kind} {count}" for kind, count in Counter(o.kind for o in self.change.objects).items())
+        return ", ".join(f"{count} {kind}" for kind, count in Counter(o.kind for o in self.change.objects).items())
 
     def _repr_html_(self) -> str:
         rows: list[tuple[str, object]] = [("this change", self._changed_here), ("before", self.pretrained)]
