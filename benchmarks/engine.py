@@ -208,7 +208,7 @@ def _cold_job(job: Row) -> Row:
     import refield
 
     light = time.perf_counter() - began
-    for name in refield.__all__:
+    for name in dir(refield):
         getattr(refield, name)
     heavy = time.perf_counter() - began
     import torch

@@ -1,6 +1,7 @@
 """Fit a field to the packaged photos, tell it from four new ones what moved, and look at the result.
 
-Run: python examples/00_move_a_cube.py [OUT]
+Run: python examples/00_move_a_cube.py [OUT [SCENE]]
+SCENE is a folder with before/, after/, eval/ and truth/, as `refield synth` writes it; by default the packaged one.
 """
 
 from __future__ import annotations
@@ -14,17 +15,16 @@ from refield.scene.change_files import load_change
 from refield.synthetic import sample_folder
 
 
-def main(out: Path) -> None:
-    sample = sample_folder()
-    capture = refield.load_capture(sample / "before")
+def main(out: Path, scene: Path) -> None:
+    capture = refield.load_capture(scene / "before")
     print(f"{len(capture.train)} photos to train on, {len(capture.held_out)} held out")
     field = refield.fit_field(capture, on_progress=lambda p: print(f"  step {p.step}: {p.psnr:.1f} dB"))
 
-    photos = refield.load_new_photos(sample / "after", capture)
+    photos = refield.load_new_photos(scene / "after", capture)
     change = refield.estimate_change(capture, field, photos, on_stage=print)
     updated = refield.update_field(capture, field, change, on_stage=print)
 
-    truth = load_change(sample / "truth")
+    truth = load_change(scene / "truth")
     for found, true in zip(change.objects, truth.objects):
         print(f"{found.kind}, confidence {found.confidence:.2f}")
         if found.new_from_old is not None and true.new_from_old is not None:
@@ -32,7 +32,7 @@ def main(out: Path) -> None:
             distance, degrees = pose_error(found.new_from_old, true.new_from_old, centre)
             print(f"  off by {100 * distance:.2f} cm and {degrees:.2f} degrees")
 
-    report = evaluate(updated, sample / "eval", old=field)
+    report = evaluate(updated, scene / "eval", old=field)
     print("after: ", report.pooled)
     print("before:", report.pooled_before)
     for view in report.views:
@@ -41,4 +41,5 @@ def main(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "moved-cube"))
+    given = sys.argv[1:]
+    main(Path(given[0] if given else "moved-cube"), Path(given[1]) if given[1:] else sample_folder())

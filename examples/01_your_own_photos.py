@@ -59,6 +59,8 @@ def new_photos(after: Path, capture: refield.Capture, cache: Path) -> list[Place
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
     try:
         main(*(Path(p) for p in sys.argv[1:4]))
     except refield.InputError as error:  # one line: where, what, what to do

@@ -1,6 +1,7 @@
 """An updated field is a field: update it again. Here the object goes back to where it was.
 
-Run: python examples/04_update_twice.py [OUT]
+Run: python examples/04_update_twice.py [OUT [SCENE]]
+SCENE is a folder with before/ and after/, photos with poses; by default the packaged one.
 """
 
 from __future__ import annotations
@@ -17,19 +18,18 @@ from refield.scene.pose import angle_between
 from refield.synthetic import sample_folder
 
 
-def main(out: Path) -> None:
-    sample = sample_folder()
-    capture = refield.load_capture(sample / "before")
+def main(out: Path, scene: Path) -> None:
+    capture = refield.load_capture(scene / "before")
     field = refield.fit_field(capture)
 
-    there = refield.load_new_photos(sample / "after", capture)
+    there = refield.load_new_photos(scene / "after", capture)
     first = refield.estimate_change(capture, field, there)
     moved = refield.update_field(capture, field, first)
 
     back = capture.held_out[:4]  # photos of the first state, which the field has not been trained on
     with tempfile.TemporaryDirectory() as scratch:
         # the old photos show the first state; where that differs, the updated field's picture stands in
-        now = retouched(capture, field, moved, Path(scratch))
+        now = retouched(capture, moved, Path(scratch))
         second = refield.estimate_change(now, moved, back)
         returned = refield.update_field(now, moved, second)
 
@@ -45,4 +45,5 @@ def main(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "update-twice"))
+    given = sys.argv[1:]
+    main(Path(given[0] if given else "update-twice"), Path(given[1]) if given[1:] else sample_folder())

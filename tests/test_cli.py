@@ -20,13 +20,12 @@ from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, Scene
 from refield.scene.exposure import Exposure
 from refield.scene.images import read_image, write_image
 from refield.scene.refined import write_refined
+from refield.visits import make
 from refield.workspace import Workspace
 from tests.conftest import HERE, TINY_FIT
 from tests.folders import contents
 from tests.photos.room import write_photos
 from tests.vision.test_perceptual import channels_of, filled, network_of
-
-update = pytest.importorskip("refield.commands.update")
 
 
 @pytest.fixture
@@ -134,7 +133,7 @@ def believing(monkeypatch, *kinds):
         photos += (PlacedPhoto(frames[3].name, "rejected", "blurred"),)
         return SceneChange(objects, photos, "because", (seen,) * 3, (seen,) * 3)
 
-    monkeypatch.setattr(update, "estimate_change", estimate)
+    monkeypatch.setattr(make, "estimate_change", estimate)
 
 
 FEW = ["--update.steps", "2", "--update.samples", "512", "--update.no-relight"]
@@ -229,7 +228,7 @@ def test_no_usable_photo(place, monkeypatch, capsys):
     def estimate(capture, field, frames, config, on_stage=None, models=None, known=()):
         return SceneChange(photos=tuple(PlacedPhoto(f.name, "rejected", "98 % changed") for f in frames))
 
-    monkeypatch.setattr(update, "estimate_change", estimate)
+    monkeypatch.setattr(make, "estimate_change", estimate)
     before = contents(place / "work")
     assert main(["update", "work", "new"]) == 2
     assert "98 % changed" in capsys.readouterr().err and contents(place / "work") == before
@@ -328,11 +327,11 @@ import os, signal, sys
 import pytest, torch
 from refield import workspace
 from refield.cli import main
-from refield.commands import update
+from refield.visits import make
 from tests.test_cli import FEW, believing
 
 name, when = sys.argv[1:]
-home = workspace if name.startswith("sync") else update
+home = workspace if name.startswith("sync") else make
 whole = getattr(home, name)
 
 def killed(*args):
@@ -391,7 +390,7 @@ def test_photos_alone_all_the_way(reconstructed, tmp_path, monkeypatch, capsys):
 
     write_photos(Path("after"), 2, turn=0.5)
     write_image(Path("after/black.png"), torch.zeros(150, 200, 3))
-    monkeypatch.setattr(update, "estimate_change", believe_photos)
+    monkeypatch.setattr(make, "estimate_change", believe_photos)
     assert main(["update", "work", "after", "--localize.features", "500"]) == 0
     assert "left out: black.png is black" in capsys.readouterr().err
     told = json.loads(Path("work/visits/001/change.json").read_text())["photos"]

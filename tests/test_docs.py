@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import os
+import pydoc
 import re
 import tomllib
 from functools import cache
@@ -109,11 +110,39 @@ def test_what_snippets_import_exists(name: str, source: str) -> None:
             assert hasattr(refield, node.attr), f"{name}: refield has no {node.attr}"
 
 
+def public() -> list[str]:
+    return [name for name in dir(refield) if not name.startswith("__")]
+
+
 def test_the_table_of_contents_is_complete() -> None:
-    for name in refield.__all__:
+    for name in public():
         assert getattr(refield, name).__module__.startswith("refield."), name
+    told = [line.name for line in declared()]
+    assert sorted(told) == public()  # what type checkers see is what there is
+    assert all(line.asname == line.name for line in declared())
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         refield.nothing  # noqa: B018
+
+
+def declared() -> list[ast.alias]:
+    """The names that `refield/__init__.py` shows to type checkers."""
+    tree = ast.parse((SOURCE / "__init__.py").read_text(encoding="utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    return [alias for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+
+
+def test_help_is_short_and_names_everything() -> None:
+    for name in public():
+        getattr(refield, name)  # what is loaded must not make it longer
+    text = pydoc.plain(pydoc.render_doc(refield))
+    assert len(text.splitlines()) < 110
+    for name in public():
+        assert re.search(rf"\b{name}\b", text), name
+        assert (getattr(refield, name).__doc__ or "").strip(), f"{name} says nothing of itself"
+
+
+def test_the_package_says_that_it_is_typed() -> None:
+    assert (SOURCE / "py.typed").is_file()
 
 
 def test_every_dependency_is_explained() -> None:

@@ -24,6 +24,18 @@ MAY_IMPORT = {
     "rehearse": {"scene", "field", "synthetic"},
     "check": {"scene", "field", "vision", "photos"},
     "history": {"scene", "field", "update", "workspace", "artefacts"},
+    "visits": {
+        "scene",
+        "field",
+        "vision",
+        "photos",
+        "estimate",
+        "update",
+        "evaluate",
+        "report",
+        "workspace",
+        "history",
+    },
     "cli": {"scene", "commands"},
     "commands": None,  # joins everything
     "__init__": None,

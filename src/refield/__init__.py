@@ -1,15 +1,43 @@
 """refield keeps a radiance field true to a scene whose objects move.
 
-    capture = refield.load_capture(Path("before"))
+A workspace, made by the command line or from Python:
+
+    scene = refield.open("work")            its visits, capture(), field(), change(), undo()
+    scene.update("after")                   a few new photos: what changed, kept as a visit
+    scene.render(scene.capture().frames[0]).rgb
+
+Step by step:
+
+    capture = refield.load_capture("before")
     field = refield.fit_field(capture)
-    photos = refield.load_new_photos(Path("after"), capture)
+    photos = refield.load_new_photos("after", capture)
     change = refield.estimate_change(capture, field, photos)
     updated = refield.update_field(capture, field, change)
+    refield.write_image("now.png", refield.render_frame(updated, photos[0]).rgb)
 
-Photos without poses: `capture_from_photos` in place of `load_capture`, `localize_photos` of `load_new_photos`.
+Functions
+    open                  a workspace as a Scene
+    load_capture          photos with poses: a transforms.json or a COLMAP model
+    capture_from_photos   photos without: poses are found
+    fit_field             a capture -> its field
+    load_new_photos       new photos with poses in the capture's world
+    localize_photos       new photos without, placed in what known_by tells of a capture
+    estimate_change       what moved, left or arrived
+    update_field          a field and a change -> the field as things are now
+    render_frame          what a field shows from where a photo was taken
+    write_image           a picture as a PNG
 
-This is the table of contents; a name is imported when it is first used. Metrics are in `refield.evaluate`,
-the report page in `refield.report`.
+Types
+    Scene, Workspace      a workspace as an object, and as a folder
+    Capture, Frame        photos with their poses
+    Field                 what is asked of a field, also of your own
+    HashField             the one that fit_field makes
+    UpdatedField          the one that update_field makes: a field again
+    SceneChange, ObjectChange, OccupancyGrid    what changed: plain data
+    InputError            input that cannot be used: where, what, and what to do
+
+help(refield.fit_field) and the like tell more. Metrics are in refield.evaluate, the report page in refield.report;
+files and axes are described in docs/conventions.md.
 """
 
 from __future__ import annotations
@@ -17,46 +45,33 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+# There is no __all__: with one, help(refield) would print every class in full. Type checkers take "name as name" for
+# public.
 if TYPE_CHECKING:
-    from refield.estimate.localize import known_by, localize_photos
-    from refield.estimate.recipe import estimate_change
-    from refield.field.fit import fit_field
-    from refield.field.radiance import Field, HashField
-    from refield.field.render import render_frame
-    from refield.photos.capture import capture_from_photos
-    from refield.scene.capture import Capture, Frame
-    from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
-    from refield.scene.errors import InputError
-    from refield.scene.images import write_image
-    from refield.scene.load import load_capture, load_new_photos
-    from refield.update.composite import UpdatedField
-    from refield.update.train import update_field
-    from refield.workspace import Workspace
+    from refield.estimate.localize import known_by as known_by
+    from refield.estimate.localize import localize_photos as localize_photos
+    from refield.estimate.recipe import estimate_change as estimate_change
+    from refield.field.fit import fit_field as fit_field
+    from refield.field.radiance import Field as Field
+    from refield.field.radiance import HashField as HashField
+    from refield.field.render import render_frame as render_frame
+    from refield.photos.capture import capture_from_photos as capture_from_photos
+    from refield.scene.capture import Capture as Capture
+    from refield.scene.capture import Frame as Frame
+    from refield.scene.change import ObjectChange as ObjectChange
+    from refield.scene.change import OccupancyGrid as OccupancyGrid
+    from refield.scene.change import SceneChange as SceneChange
+    from refield.scene.errors import InputError as InputError
+    from refield.scene.images import write_image as write_image
+    from refield.scene.load import load_capture as load_capture
+    from refield.scene.load import load_new_photos as load_new_photos
+    from refield.update.composite import UpdatedField as UpdatedField
+    from refield.update.train import update_field as update_field
+    from refield.visits.opened import Scene as Scene
+    from refield.visits.opened import open as open
+    from refield.workspace import Workspace as Workspace
 
 __version__ = "0.1.0"
-
-__all__ = [
-    "Capture",
-    "Field",
-    "Frame",
-    "HashField",
-    "InputError",
-    "ObjectChange",
-    "OccupancyGrid",
-    "SceneChange",
-    "UpdatedField",
-    "Workspace",
-    "capture_from_photos",
-    "estimate_change",
-    "fit_field",
-    "known_by",
-    "load_capture",
-    "load_new_photos",
-    "localize_photos",
-    "render_frame",
-    "update_field",
-    "write_image",
-]
 
 _HOME = {
     "scene.capture": ("Capture", "Frame"),
@@ -72,6 +87,7 @@ _HOME = {
     "photos.capture": ("capture_from_photos",),
     "update.composite": ("UpdatedField",),
     "update.train": ("update_field",),
+    "visits.opened": ("Scene", "open"),
     "workspace": ("Workspace",),
 }
 _MODULE_OF = {name: f"refield.{module}" for module, names in _HOME.items() for name in names}
@@ -84,4 +100,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*__all__, "__version__"])
+    return sorted([*_MODULE_OF, "__doc__", "__version__"])

@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from refield.field.radiance import Field
+from refield.field.radiance import Field, check_field
 from refield.field.render import render_frame
 from refield.scene.capture import Frame
 from refield.scene.errors import InputError
+from refield.scene.files import AnyPath, as_path
 from refield.scene.images import frame_image, read_mask
 from refield.scene.pose import angle_between, transform
 from refield.scene.transforms_json import load_transforms, stem_of
@@ -112,7 +113,7 @@ class Report:
 
 def evaluate(
     field: Field,
-    folder: Path | str,
+    folder: AnyPath,
     *,
     old: Field | None = None,
     frames: Sequence[Frame] | None = None,
@@ -129,7 +130,8 @@ def evaluate(
     Raises:
         InputError: the folder cannot be read, or a mask is missing or of another size than its image.
     """
-    folder = Path(folder)
+    folder = as_path(folder, "the evaluation's folder")
+    check_field(field)
     views = []
     for frame in looked_over(folder, frames):
         if on_view is not None:

@@ -36,7 +36,7 @@ from refield.scene.capture import Capture, Frame
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.change_files import load_change, save_change
 from refield.scene.errors import InputError
-from refield.scene.files import read_json, write_json
+from refield.scene.files import AnyPath, as_path, read_json, write_json
 from refield.scene.refined import NAME as REFINED
 from refield.scene.refined import refined, write_refined
 from refield.scene.transforms_json import load_transforms, save_transforms
@@ -78,16 +78,20 @@ def refuse_inside(*paths: Path) -> None:
 class Workspace:
     """An open workspace. Make one by :meth:`building`, find one by :meth:`open`."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: AnyPath) -> None:
+        self.path = as_path(path, "the workspace")
+
+    def __repr__(self) -> str:
+        return f"Workspace({str(self.path)!r})"
 
     @staticmethod
-    def open(path: Path) -> Workspace:
+    def open(path: AnyPath) -> Workspace:
         """An existing workspace.
 
         Raises:
             InputError: ``path`` is not one, or of a newer format.
         """
+        path = as_path(path, "the workspace")
         if not (path / MARKER).is_file():
             what = "is not a refield workspace" if path.exists() else "there is no such workspace"
             raise InputError(path, what, f"make one with: refield train DATA {path}")
@@ -98,7 +102,7 @@ class Workspace:
         return Workspace(path)
 
     @staticmethod
-    def refuse_unless_free(path: Path, *, overwrite: bool, option: str | None = "--overwrite") -> None:
+    def refuse_unless_free(path: AnyPath, *, overwrite: bool, option: str | None = "--overwrite") -> None:
         """Check that a workspace may be made at ``path``, before any work. ``option``: the command's that would allow
         what is refused; None if it has none.
 
@@ -106,6 +110,7 @@ class Workspace:
             InputError: something is there that we did not write, or a workspace and not ``overwrite``; or it lies in
                 what another workspace keeps.
         """
+        path = as_path(path, "the workspace")
         refuse_inside(path)
         if path.exists() and not path.is_dir():
             raise InputError(path, "is a file, not a folder", "choose another output folder")
@@ -126,11 +131,12 @@ class Workspace:
 
     @staticmethod
     @contextlib.contextmanager
-    def building(path: Path, *, overwrite: bool = False, made_by: str = "train") -> Iterator[Workspace]:
+    def building(path: AnyPath, *, overwrite: bool = False, made_by: str = "train") -> Iterator[Workspace]:
         """A new workspace under construction: fill it with `keep_capture` and `keep_field`.
 
         It appears at ``path`` when the block ends well, not at all otherwise. What else lies there stays.
         """
+        path = as_path(path, "the workspace")
         Workspace.refuse_unless_free(path, overwrite=overwrite)
         made = _missing(path)
         with writable(path):
@@ -147,11 +153,12 @@ class Workspace:
 
     @staticmethod
     @contextlib.contextmanager
-    def caching(path: Path) -> Iterator[Path]:
+    def caching(path: AnyPath) -> Iterator[Path]:
         """The folder, made if need be, in which a workspace that is to be made at ``path`` keeps what takes long.
 
         Unlike the workspace it is there from the beginning, so that what was interrupted goes on.
         """
+        path = as_path(path, "the workspace")
         refuse_inside(path)
         made = _missing(path)
         with writable(path):
@@ -187,8 +194,9 @@ class Workspace:
         return World.from_dict(read_json(path), path) if path.is_file() else world_of(self.capture())
 
     @staticmethod
-    def made_by(path: Path) -> str | None:
+    def made_by(path: AnyPath) -> str | None:
         """The command that made the workspace at ``path``; None if there is none."""
+        path = as_path(path, "the workspace")
         return read_json(path / MARKER).get("made_by") if (path / MARKER).is_file() else None
 
     def keep_capture(self, capture: Capture) -> Capture:

@@ -16,13 +16,14 @@ from refield.commands.clock import Clock
 from refield.commands.evaluate import table
 from refield.commands.options import PLAIN, Output
 from refield.commands.train import Sources, train
-from refield.commands.update import Update, Visit, facts_of, update
+from refield.commands.update import Update, facts_of, update
 from refield.evaluate import pose_error
 from refield.field.fit import FitConfig
 from refield.report import summary
 from refield.scene.change import SceneChange
 from refield.scene.change_files import load_change
 from refield.synthetic import sample_folder
+from refield.visits.visit import Visit
 from refield.workspace import Workspace
 
 EXAMPLES = ("refield demo",)

@@ -14,7 +14,6 @@ from refield.artefacts import writable
 from refield.commands.answer import Answer
 from refield.commands.clock import Clock
 from refield.commands.options import PLAIN, Output
-from refield.commands.placing import Placing, placed_photos
 from refield.estimate.localize import LocalizeConfig
 from refield.evaluate import EvaluateConfig, Report, Scores, evaluate, looked_over, need_masks
 from refield.history import state
@@ -26,6 +25,7 @@ from refield.scene.files import read_json, write_json
 from refield.scene.load import is_posed
 from refield.vision.perceptual import Perceptual, open_lpips
 from refield.vision.weights import WeightsError
+from refield.visits.placing import Placing, placed_photos
 from refield.workspace import Workspace, refuse_inside
 
 EXAMPLES = ("refield evaluate work eval", "refield evaluate work eval --out numbers.json")

@@ -21,7 +21,7 @@ from refield.commands.answer import Answer
 from refield.commands.clock import Clock, duration
 from refield.commands.options import PLAIN, Output
 from refield.commands.train import Sources, train
-from refield.commands.update import Update, Visit, update
+from refield.commands.update import Update, update
 from refield.evaluate import Report
 from refield.field.fit import FitConfig, need_device
 from refield.field.quality import OPEN, Quality
@@ -32,6 +32,7 @@ from refield.scene.change_files import load_change
 from refield.scene.errors import InputError
 from refield.scene.files import read_json, write_json
 from refield.scene.world import world_of
+from refield.visits.visit import Visit
 from refield.workspace import Workspace, refuse_inside
 
 REPORT = "rehearsals.json"

@@ -10,7 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from refield.commands.answer import Answer
 from refield.commands.options import PLAIN, Output
-from refield.scene.errors import InputError
+from refield.visits.make import take_back
 from refield.workspace import Workspace
 
 EXAMPLES = ("refield undo work",)
@@ -26,12 +26,6 @@ class Undo:
 
 
 def run(options: Undo) -> Answer:
-    workspace = Workspace.open(options.work)
-    with workspace.writing():
-        number = workspace.visits
-        if number == 0:
-            what = "has had no visit, so there is nothing to take back"
-            raise InputError(options.work, what, f"make one with: refield update {options.work} PHOTOS")
-        workspace.drop_last_visit()
+    number = take_back(Workspace.open(options.work))
     words = f"visit {number} is taken back; {options.work} is as it was after visit {number - 1}"
     return Answer({"workspace": options.work, "undone": number, "visits": number - 1}, [words])

@@ -22,9 +22,10 @@ from refield.photos.gather import Gathered, OnProgress, gather
 from refield.photos.landmarks import Landmarks, describe, read_landmarks, triangulated, write_landmarks
 from refield.photos.motion import Counting, silent
 from refield.photos.taken import PhotoConfig, Taken, pixels_of
-from refield.scene.capture import Capture, Frame, centres
+from refield.scene.capture import Capture, Frame, centres, check_capture
 from refield.scene.change import PlacedPhoto, Placement
-from refield.scene.errors import InputError
+from refield.scene.errors import InputError, expect
+from refield.scene.files import AnyPath, as_path
 from refield.scene.images import read_image
 from refield.scene.left_out import named
 from refield.vision.describer import Describer
@@ -81,9 +82,9 @@ def localize(
 
 
 def localize_photos(
-    folder: Path,
+    folder: AnyPath,
     known: Known,
-    cache: Path,
+    cache: AnyPath,
     config: LocalizeConfig = LocalizeConfig(),
     photos: PhotoConfig | None = None,
     counting: Counting | None = None,
@@ -97,7 +98,9 @@ def localize_photos(
     Raises:
         InputError: there are no photos, or none that can be used.
     """
-    return localize_taken(take_in(folder, cache, photos, counting), known, config, counting)
+    expect("what the photos are placed in", known, Known, "what refield.known_by makes of a capture and its landmarks")
+    place, kept = as_path(folder, "the new photos' folder"), as_path(cache, "the cache")
+    return localize_taken(take_in(place, kept, photos, counting), known, config, counting)
 
 
 def take_in(folder: Path, cache: Path, photos: PhotoConfig | None = None, counting: Counting | None = None) -> Gathered:
@@ -121,12 +124,14 @@ def localize_taken(
     return [*placed, *(PlacedPhoto(name, "rejected", why) for name, why in gathered.left_out)]
 
 
-def kept_landmarks(path: Path, capture: Capture, cache: Path, counting: Counting | None = None) -> Landmarks:
+def kept_landmarks(path: AnyPath, capture: Capture, cache: AnyPath, counting: Counting | None = None) -> Landmarks:
     """The landmarks in the file ``path``; of a capture that came with poses they are made now, once.
 
     Raises:
         InputError: the capture's photos do not agree with its poses.
     """
+    path, cache = as_path(path, "the landmarks' file"), as_path(cache, "the cache")
+    check_capture(capture)
     landmarks = read_landmarks(path, capture)
     if landmarks is None:
         landmarks = triangulated(capture, cache / "posed", counting=counting)
@@ -138,6 +143,9 @@ def known_by(
     capture: Capture, landmarks: Landmarks, describer: Describer | None = None, counting: Counting | None = None
 ) -> Known:
     """What new photos are placed in; a describer looks at every old photo first."""
+    check_capture(capture)
+    give = "those that refield.estimate.localize.kept_landmarks finds in it"
+    expect("what is given as the capture's landmarks", landmarks, Landmarks, give)
     if describer is None:
         return Known(capture, landmarks, landmarks.globals_)
     tell, vectors = (counting or silent)("old photos described"), []

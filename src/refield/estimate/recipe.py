@@ -25,9 +25,9 @@ from refield.estimate.paper.route import estimate_change_paper
 from refield.estimate.place import PlaceConfig, place
 from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
-from refield.field.radiance import Field
+from refield.field.radiance import Field, check_field
 from refield.field.source import Known
-from refield.scene.capture import Capture, Frame
+from refield.scene.capture import Capture, Frame, check_capture, check_frames
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
 from refield.scene.planes import Plane, rough_planes
@@ -106,8 +106,12 @@ def estimate_change(
             segmented again (§11.3.2).
 
     Raises:
-        InputError: most of the pixels changed: the photos show another scene; or a model cannot be opened.
+        InputError: there is no new photo; most of the pixels changed: the photos show another scene; or a model cannot
+            be opened.
     """
+    check_capture(capture)
+    check_field(field)
+    check_frames(frames)
     models = config.models.open() if models is None else models
     if config.route == "paper":
         return estimate_change_paper(capture, field, frames, models, config.paper, on_stage)

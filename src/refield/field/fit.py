@@ -23,8 +23,8 @@ from refield.field.photos import UNCHANGED, Photos, Since
 from refield.field.placing import COLOUR_IN, DIRECTED, around, new_field, opened, place_contraction, stand_outside
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.sampling import STOP
-from refield.scene.capture import Capture
-from refield.scene.errors import InputError
+from refield.scene.capture import Capture, check_capture
+from refield.scene.errors import InputError, expect
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,11 @@ def fit_field(
     start: HashField | None = None,
     on_step: StepCallback | None = None,
 ) -> HashField:
-    """`fit_capture`'s field alone."""
+    """Fit a field to a capture's training photos, from random weights or on from ``start``.
+
+    ``on_progress`` hears each look at the held-out pixels. This is the field of what `fit_capture` gives; see there for
+    the rest and for what it raises.
+    """
     return fit_capture(capture, config, on_progress, since=since, start=start, on_step=on_step).field
 
 
@@ -162,6 +166,8 @@ def fit_capture(
         InputError: a GPU is wanted and there is none.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row; it holds the last good state.
     """
+    check_capture(capture)
+    expect("the config of a fit", config, FitConfig, "a refield.field.fit.FitConfig")
     capture, since = as_read(capture, since, config.size)
     began, photos = time.perf_counter(), Photos.of(capture, since, most_pixels(config))
     core = _core(capture) if start is None and config.look_around else None

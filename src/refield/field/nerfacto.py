@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,6 +24,8 @@ from refield.field.sampling import OccupancySampler
 from refield.field.stored import State, read_field, sampler_from, state_of, write_field
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
+from refield.scene.files import AnyPath, as_path
+from refield.scene.notebook import facts
 
 Inside = Callable[[Tensor], Tensor]
 """World points (S, 3) -> whether they are inside of something, (S,) bool"""
@@ -171,14 +172,26 @@ class NerfactoField(nn.Module):
         field.load_state_dict(tensors)
         return field.eval().requires_grad_(False)
 
-    def save(self, folder: Path) -> None:
+    def save(self, folder: AnyPath) -> None:
         """Write ``field.safetensors`` and ``field.json`` into an existing folder."""
-        write_field(folder, self.state())
+        write_field(as_path(folder, "the field's folder"), self.state())
 
     @staticmethod
-    def load(folder: Path) -> NerfactoField:
+    def load(folder: AnyPath) -> NerfactoField:
         """Inverse of :meth:`save`. Raises InputError naming the file that is missing or not ours."""
-        return read_field(folder, "NerfactoField", NerfactoField.from_state)
+        return read_field(as_path(folder, "the field's folder"), "NerfactoField", NerfactoField.from_state)
+
+    def __repr__(self) -> str:
+        return f"NerfactoField({'; '.join(f'{name} {value}' for name, value in self._facts())})"
+
+    def _facts(self) -> list[tuple[str, object]]:
+        c = self.config
+        grid = f"of {c.levels} levels, {c.coarsest} to {c.finest} cells a side, 2^{c.log2_table} entries each"
+        asked = " and ".join(str(p.samples) for p in c.proposals)
+        return [("hash grid", grid), ("samples a ray", f"{c.samples}, proposed from {asked}"), *self.sampler.facts()]
+
+    def _repr_html_(self) -> str:
+        return facts("NerfactoField", self._facts())
 
     def looking_where(self, grid: Tensor) -> None:
         """Replace the occupancy grid (R, R, R) uint8 that others march through; own samples do not heed it."""

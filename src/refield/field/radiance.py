@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -18,6 +17,9 @@ from refield.field.sampling import STOP, OccupancySampler
 from refield.field.stored import State, read_field, sampler_from, state_of, write_field
 from refield.field.volrend import Rendering, Samples
 from refield.scene.capture import Rays
+from refield.scene.errors import wrong
+from refield.scene.files import AnyPath, as_path
+from refield.scene.notebook import facts
 
 
 @runtime_checkable
@@ -37,6 +39,18 @@ class Field(Protocol):
     def __call__(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """World points (..., 3) and unit directions (..., 3) -> sigma (...,) and rgb (..., 3) in [0, 1]."""
         ...
+
+
+def check_field(field: Field) -> None:
+    """Check that a caller's field has what `Field` asks for.
+
+    Raises:
+        TypeError: it lacks something, or is no field at all.
+    """
+    lacks = [name for name in ("sampler", "density", "__call__") if not hasattr(field, name)]
+    if lacks:
+        give = f"one as refield.fit_field makes it, or an object of your own with {', '.join(lacks)} (refield.Field)"
+        raise wrong("the field", field, give)
 
 
 @dataclass(frozen=True)
@@ -154,14 +168,25 @@ class HashField(nn.Module):
         field.load_state_dict(tensors)
         return field.eval().requires_grad_(False)
 
-    def save(self, folder: Path) -> None:
+    def save(self, folder: AnyPath) -> None:
         """Write ``field.safetensors`` and ``field.json`` into an existing folder."""
-        write_field(folder, self.state())
+        write_field(as_path(folder, "the field's folder"), self.state())
 
     @staticmethod
-    def load(folder: Path) -> HashField:
+    def load(folder: AnyPath) -> HashField:
         """Inverse of :meth:`save`. Raises InputError naming the file that is missing or not ours."""
-        return read_field(folder, "HashField", HashField.from_state)
+        return read_field(as_path(folder, "the field's folder"), "HashField", HashField.from_state)
+
+    def __repr__(self) -> str:
+        return f"HashField({'; '.join(f'{name} {value}' for name, value in self._facts())})"
+
+    def _facts(self) -> list[tuple[str, object]]:
+        c = self.config
+        grid = f"of {c.levels} levels, {c.coarsest} to {c.finest} cells a side, 2^{c.log2_table} entries each"
+        return [("hash grid", grid), ("networks", f"{c.width} wide"), *self.sampler.facts()]
+
+    def _repr_html_(self) -> str:
+        return facts("HashField", self._facts())
 
     def looking_where(self, grid: Tensor, fine: Tensor | None = None) -> None:
         """Replace the occupancy grid (R, R, R) uint8, and what is known of its cells' parts (R, R, R) int64."""

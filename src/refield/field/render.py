@@ -7,10 +7,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from refield.field.radiance import Field
+from refield.field.radiance import Field, check_field
 from refield.field.volrend import Rendering, Samples, composite
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
+from refield.scene.errors import expect
 
 CHUNK = 16384  # rays; at 20 samples a ray the activations of a chunk take some 100 MB
 
@@ -69,4 +70,6 @@ def render_camera(field: Field, camera: Camera, world_from_cam: Tensor, chunk: i
 
 def render_frame(field: Field, frame: Frame, chunk: int = CHUNK) -> Rendering:
     """What the field shows from where a photo was taken; leading shape (height, width)."""
+    check_field(field)
+    expect("the frame to render", frame, Frame, "a Frame, such as capture.frames[0]")
     return render_camera(field, frame.camera, frame.world_from_cam, chunk)

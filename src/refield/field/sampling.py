@@ -20,7 +20,7 @@ RESOLUTION = 128  # cells a side of the occupancy grid
 STOP = 7.0  # optical depth at which a ray ends: e^-7 is a thousandth
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class OccupancySampler:
     """Samples on a regular lattice along the ray, kept where the grid says that something may be."""
 
@@ -40,6 +40,17 @@ class OccupancySampler:
     @property
     def resolution(self) -> int:
         return self.grid.shape[0]
+
+    def __repr__(self) -> str:
+        return f"OccupancySampler({'; '.join(f'{name} {value}' for name, value in self.facts())})"
+
+    def facts(self) -> list[tuple[str, object]]:
+        """What to tell a person of it."""
+        least = 1e-6 * self.contraction.radius
+        at = ", ".join(f"{v if abs(v) > least else 0:.4g}" for v in self.contraction.centre.tolist())
+        full = 100 * float((self.grid > 0).float().mean())
+        where = f"({at}), {self.contraction.radius:.4g} to each side"
+        return [("core around", where), ("occupied", f"{full:.2g} % of {self.resolution}³ cells")]
 
     def __call__(self, rays: Rays, jitter: bool = False) -> Samples:
         """Packed samples of N rays; see `Samples`."""

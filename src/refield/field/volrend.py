@@ -19,6 +19,7 @@ from refield.field import kernels
 from refield.field.kernels.cpu.simd import JIT
 from refield.field.kernels.reference import seen, to_be_seen
 from refield.scene.capture import Rays
+from refield.scene.images import png
 
 _Samples = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
 
@@ -56,7 +57,7 @@ class Samples:
         return rays.origins[ids] + d * mid[:, None], d
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Rendering:
     """What a set of rays, or a view, looks like. Leading shape (N,) or (H, W)."""
 
@@ -70,6 +71,13 @@ class Rendering:
 
     def reshape(self, *shape: int) -> Rendering:
         return Rendering(self.rgb.reshape(*shape, 3), self.depth.reshape(shape), self.opacity.reshape(shape))
+
+    def __repr__(self) -> str:
+        return f"Rendering({' x '.join(map(str, self.depth.shape))})"
+
+    def _repr_png_(self) -> bytes | None:
+        """A view, for notebooks; None for rays that make none."""
+        return png(self.rgb) if self.rgb.dim() == 3 else None
 
     @staticmethod
     def joined(parts: Sequence[Rendering]) -> Rendering:

@@ -12,7 +12,7 @@ from refield.photos.motion import Counting, Motion, MotionConfig, need_three, re
 from refield.photos.taken import PhotoConfig
 from refield.scene.capture import Capture
 from refield.scene.errors import InputError
-from refield.scene.files import log_warning
+from refield.scene.files import AnyPath, as_path, log_warning
 from refield.scene.left_out import Warn, named
 
 _SHARE = 0.5  # of the photos, that may be unusable
@@ -41,8 +41,8 @@ class FromPhotos:
 
 
 def capture_from_photos(
-    folder: Path,
-    cache: Path,
+    folder: AnyPath,
+    cache: AnyPath,
     config: FromPhotosConfig = FromPhotosConfig(),
     *,
     warn: Warn = log_warning,
@@ -56,6 +56,7 @@ def capture_from_photos(
     Raises:
         InputError: too few photos can be used, or can be placed in one model.
     """
+    folder, cache = as_path(folder, "the photos' folder"), as_path(cache, "the cache")
     count = counting or silent
     new = not (cache / INDEX).exists()
     gathered = gather(folder, cache, config.photos, count("photos"))

@@ -6,7 +6,7 @@ photo cannot be used as a view by mistake. World units and axes are the capture'
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -15,7 +15,10 @@ import torch
 from torch import Tensor
 
 from refield.scene.camera import Camera
+from refield.scene.errors import InputError, expect
 from refield.scene.exposure import Exposure
+
+_MOST_SHOWN = 6  # photos or cameras in a notebook
 
 
 class Made(Protocol):
@@ -37,7 +40,7 @@ class Made(Protocol):
         not all is so."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Photo:
     """An image file and the camera that took it; where it was taken is not known."""
 
@@ -63,8 +66,11 @@ class Photo:
             return self
         return replace(self, camera=self.camera.scaled(*self.file_size), file_size=None)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}, {self.camera.width} x {self.camera.height})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Frame(Photo):
     """A photo with its pose."""
 
@@ -75,6 +81,10 @@ class Frame(Photo):
     def centre(self) -> Tensor:
         """Camera centre in the world, (3,) float64."""
         return self.world_from_cam[:3, 3]
+
+    def __repr__(self) -> str:
+        at = ", ".join(f"{v:.4g}" for v in self.centre.tolist())
+        return f"Frame({self.name!r}, {self.camera.width} x {self.camera.height}, at ({at}))"
 
 
 @dataclass(frozen=True)
@@ -98,7 +108,7 @@ def camera_rays(camera: Camera, world_from_cam: Tensor, pixels: Tensor | None = 
     return Rays(world_from_cam[:3, 3].float().expand(len(d), 3).contiguous(), d.float().contiguous())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Capture:
     """Posed photos of one state of the scene, and what structure from motion knows of it."""
 
@@ -117,6 +127,48 @@ class Capture:
     def train(self) -> tuple[Frame, ...]:
         k = self.held_out_every
         return tuple(f for i, f in enumerate(self.frames) if not (k and i % k == k // 2))
+
+    def __repr__(self) -> str:
+        return f"Capture({', '.join(f'{value} {name}' for name, value in self._facts().items())})"
+
+    def _facts(self) -> dict[str, int]:
+        return {"photos": len(self.frames), "held out": len(self.held_out), "points": len(self.points)}
+
+    def _repr_html_(self) -> str:
+        from refield.scene import notebook
+
+        cameras = dict.fromkeys(frame.camera for frame in self.frames)
+        sizes = [f"{c.width} x {c.height}, focal length {c.fx:.4g} px" for c in cameras]
+        more = [f"and {len(sizes) - _MOST_SHOWN} more"] if len(sizes) > _MOST_SHOWN else []
+        rows = [*self._facts().items(), *(("camera", told) for told in sizes[:_MOST_SHOWN] + more)]
+        there = [frame for frame in self.frames if frame.made is None]
+        some = there[:: max(-(-len(there) // _MOST_SHOWN), 1)]
+        return notebook.facts("Capture", rows) + notebook.strip((f.name, notebook.thumbnail(f)) for f in some)
+
+
+def check_capture(capture: Capture) -> None:
+    """Check a caller's argument. Raises TypeError: it is no capture."""
+    made = "as refield.load_capture makes one, or the .capture of what refield.capture_from_photos gives"
+    expect("the capture", capture, Capture, f"a Capture, {made}")
+
+
+def check_frames(frames: Sequence[Frame]) -> None:
+    """Check a caller's argument.
+
+    Raises:
+        TypeError: it is no list of frames.
+        InputError: there is none, or several have one name.
+    """
+    give = "a list of frames, as refield.load_new_photos makes one, or the .frame of each placed photo"
+    expect("what is given as frames", frames, (list, tuple), give)
+    for i, frame in enumerate(frames):
+        expect(f"frame {i}", frame, Frame, give)
+    names = [frame.name for frame in frames]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if not names:
+        raise InputError("the new photos", "there are none", "give one or more, 4 is a good number")
+    if twice is not None:
+        raise InputError("the new photos", f"several are called {twice!r}", "give each a name of its own")
 
 
 def centres(frames: Iterable[Frame]) -> Tensor:

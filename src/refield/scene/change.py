@@ -6,22 +6,24 @@ An object is an occupancy grid (§4.2.4) in the world, a kind, and for a moved o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from refield.scene.capture import Frame, Rays
 from refield.scene.inside import in_grid, meet_grid, trilinear
-from refield.scene.pose import invert, transform
+from refield.scene.pose import invert, rotation_log, transform
 
 Kind = Literal["moved", "removed", "added"]
+_IN, _OUT, _UNCLEAR = (16, 185, 199), (249, 115, 22), (147, 51, 234)  # as on the report's page
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class OccupancyGrid:
     """An object's 3-D mask M: values at the grid's nodes, corner to corner of a world-aligned box."""
 
@@ -110,8 +112,12 @@ class OccupancyGrid:
         grid = OccupancyGrid(torch.stack([lo, lo + (shape - 1) * cell]), torch.zeros(*shape.tolist()))
         return replace(grid, values=self.sample(transform(invert(new_from_old), grid.nodes())))
 
+    def __repr__(self) -> str:
+        shape, box = " x ".join(map(str, self.values.shape)), self.tight_aabb()
+        return f"OccupancyGrid({shape}, from {_place(box[0])} to {_place(box[1])})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class ObjectChange:
     """One object that moved, left or arrived."""
 
@@ -166,6 +172,19 @@ class ObjectChange:
             return None
         return self.grid if self.new_from_old is None else self.grid.moved(self.new_from_old)
 
+    @property
+    def turn_deg(self) -> float | None:
+        """By how much a moved object turned, [0, 180]."""
+        if self.new_from_old is None:
+            return None
+        return math.degrees(float(rotation_log(self.new_from_old[:3, :3].double()).norm()))
+
+    def __repr__(self) -> str:
+        told = f"{self.kind} at {_place(self.centre)}"
+        if self.shift is not None:
+            told = f"moved from {_place(self.centre)} by {float(self.shift.norm()):.4g}, turned {self.turn_deg:.1f}°"
+        return f"ObjectChange({told}, confidence {self.confidence:.2f})"
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -197,7 +216,7 @@ class PlacedPhoto:
             raise ValueError("a used photo has a frame; a rejected one has none")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SceneChange:
     """Everything that changed. No objects means: nothing changed."""
 
@@ -225,3 +244,48 @@ class SceneChange:
             for p in placed
         ]
         return replace(self, photos=tuple(photos))
+
+    def __repr__(self) -> str:
+        objects = ", ".join(map(repr, self.objects)) or self._nothing
+        return f"SceneChange({objects}; {self._counted})"
+
+    @property
+    def _nothing(self) -> str:
+        return "changed, but not understood" if self.unexplained else "nothing changed"
+
+    @property
+    def _counted(self) -> str:
+        return f"{len(self.frames)} of {len(self.photos)} photos used"
+
+    def _repr_html_(self) -> str:
+        from refield.scene import notebook
+
+        heads = ("what", "where", "moved by", "turned by", "confidence", "note")
+        told = notebook.table(heads, [_row(o) for o in self.objects]) if self.objects else ""
+        rows: list[tuple[str, object]] = [("photos", self._counted)]
+        rows += [("why", self.why)] if self.why else []
+        if not self.objects:
+            rows.insert(0, ("objects", self._nothing))
+        pictures: list[tuple[str, Any]] = []
+        used = 0
+        for photo in self.photos:
+            if photo.frame is None:
+                pictures.append((f"{photo.name}: {photo.why or 'rejected'}", None))
+                continue
+            image = notebook.thumbnail(photo.frame)
+            kinds = ((self.masks_out, _OUT), (self.masks_in, _IN), (self.unexplained, _UNCLEAR))
+            masks = [(kind[used], colour) for kind, colour in kinds if kind]
+            pictures.append((photo.name, None if image is None else notebook.inked(image, masks)))
+            used += 1
+        return notebook.facts("Change", rows) + told + notebook.strip(pictures)
+
+
+def _place(x: Tensor) -> str:
+    return f"({', '.join(f'{v:.4g}' for v in x.tolist())})"
+
+
+def _row(o: ObjectChange) -> tuple[str, ...]:
+    """Of the notebook's table."""
+    moved = "" if o.shift is None else f"{float(o.shift.norm()):.4g}"
+    turned = "" if o.turn_deg is None else f"{o.turn_deg:.1f}°"
+    return o.kind, _place(o.centre), moved, turned, f"{o.confidence:.2f}", o.note

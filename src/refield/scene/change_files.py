@@ -21,7 +21,7 @@ from refield.scene import images
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, Placement, SceneChange
 from refield.scene.errors import InputError
-from refield.scene.files import inside, read_json, write_bytes, write_json
+from refield.scene.files import AnyPath, as_path, inside, read_json, write_bytes, write_json
 from refield.scene.intrinsics import read_camera, write_camera
 
 NAME = "change.json"
@@ -30,12 +30,13 @@ _PHOTO_MASKS = ("masks_in", "masks_out", "unexplained")
 _REMEDY = "run the update again, or restore the file"
 
 
-def save_change(folder: Path, change: SceneChange) -> None:
+def save_change(folder: AnyPath, change: SceneChange) -> None:
     """Write ``change`` into an existing folder.
 
     The image of a used photo is recorded where it lies inside ``folder``; a caller who wants the folder to be
     self-contained copies the photos there first.
     """
+    folder = as_path(folder, "the change's folder")
     objects = [_object_out(folder, i, o) for i, o in enumerate(change.objects)]
     photos = [_photo_out(folder, p) for p in change.photos]
     record: dict[str, Any] = {"objects": objects, "photos": photos, "why": change.why}
@@ -46,7 +47,7 @@ def save_change(folder: Path, change: SceneChange) -> None:
 
 
 def load_change(
-    folder: Path, capture: Capture | None = None, *, photos: Sequence[Frame] = (), masks: bool = True
+    folder: AnyPath, capture: Capture | None = None, *, photos: Sequence[Frame] = (), masks: bool = True
 ) -> SceneChange:
     """Read what `save_change` wrote.
 
@@ -57,6 +58,7 @@ def load_change(
     Raises:
         InputError: a file or key is missing, or holds what it cannot.
     """
+    folder = as_path(folder, "the change's folder")
     record = read_json(folder / NAME)
     try:
         return SceneChange(

@@ -24,3 +24,21 @@ def did_you_mean(given: str, known: Iterable[str]) -> str:
             folded[form.lower()] = name
     near = difflib.get_close_matches(given.lower(), folded, n=1, cutoff=0.6)
     return f"did you mean {folded[near[0]]!r}? " if near else ""
+
+
+def expect(what: str, value: object, kinds: type | tuple[type, ...], give: str) -> None:
+    """Check a caller's argument, which ``what`` names.
+
+    Raises:
+        TypeError: it is of none of the ``kinds``; the sentence ends with ``give``.
+    """
+    if not isinstance(value, kinds):
+        raise wrong(what, value, give)
+
+
+def wrong(what: str, value: object, give: str) -> TypeError:
+    """A caller's argument is not of its type: a sentence that says what came, and what to give."""
+    itself = f" ({value!r})" if isinstance(value, str | int | float) and len(repr(value)) < 60 else ""
+    name = type(value).__name__
+    came = "None" if value is None else f"{'an' if name[0] in 'aeiouAEIOU' else 'a'} {name}{itself}"
+    return TypeError(f"{what} is {came}; give {give}")

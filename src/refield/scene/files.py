@@ -14,9 +14,22 @@ import tempfile
 from pathlib import Path
 from typing import Any, NoReturn
 
-from refield.scene.errors import InputError
+from refield.scene.errors import InputError, expect
+
+AnyPath = str | os.PathLike[str]
+"""what a function takes wherever it wants a file or folder"""
 
 MAX_JSON_BYTES = 64 * 1024 * 1024  # 10,000 frames are 10 MB; beyond this it is not a camera file
+
+
+def as_path(path: AnyPath, what: str) -> Path:
+    """A caller's argument, which ``what`` names, as a path.
+
+    Raises:
+        TypeError: it is no path.
+    """
+    expect(what, path, (str, os.PathLike), "a path, as text or as a pathlib.Path")
+    return Path(path)
 
 
 def log_warning(message: str) -> None:

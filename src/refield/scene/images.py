@@ -20,8 +20,8 @@ from torch import Tensor
 
 from refield.scene.camera import Camera
 from refield.scene.capture import Photo
-from refield.scene.errors import InputError
-from refield.scene.files import write_bytes
+from refield.scene.errors import InputError, expect
+from refield.scene.files import AnyPath, as_path, write_bytes
 
 MAX_PIXELS = 64_000_000
 """A 48-megapixel phone photo passes; what is larger is more likely a bomb or a mistake."""
@@ -135,18 +135,31 @@ def read_mask(path: Path, *, max_pixels: int = MAX_PIXELS) -> Tensor:
         return torch.from_numpy(grey > (127 if grey.max() > 1 else 0))
 
 
-def write_image(path: Path, image: Tensor) -> None:
-    """Write a PNG at once: uint8 or float [0, 1] (H, W, 3) or (H, W), or a bool (H, W) mask in one bit a pixel."""
+def write_image(path: AnyPath, image: Tensor) -> None:
+    """Write a PNG at once: uint8 or float [0, 1] (H, W, 3) or (H, W), or a bool (H, W) mask in one bit a pixel.
+
+    Raises:
+        ValueError: it has another shape, or holds values that are not finite.
+    """
+    path, shown = as_path(path, "the picture's file"), "a tensor (H, W, 3) or (H, W), such as the rgb of a rendering"
+    expect("the picture", image, Tensor, shown)
+    if image.dim() != 2 and (image.dim() != 3 or image.shape[-1] != 3):
+        raise ValueError(f"{path}: a picture of the shape {tuple(image.shape)} cannot be written; give {shown}")
+    if image.is_floating_point() and not bool(image.isfinite().all()):
+        raise ValueError(f"{path}: the picture holds values that are not finite")
+    write_bytes(path, png(image), durable=False)
+
+
+def png(image: Tensor) -> bytes:
+    """A picture as `write_image` writes it."""
     image = image.detach().cpu()
     if image.is_floating_point():
-        if not bool(image.isfinite().all()):
-            raise ValueError(f"{path}: the picture holds values that are not finite")
         image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
     buffer = io.BytesIO()
     mark = PngImagePlugin.PngInfo()
     mark.add_text(*_MARK)
     Image.fromarray(image.numpy()).save(buffer, format="PNG", pnginfo=mark)
-    write_bytes(path, buffer.getvalue(), durable=False)
+    return buffer.getvalue()
 
 
 def is_ours(path: Path) -> bool:

@@ -7,6 +7,7 @@ cut out: nothing is left inside them.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from torch.nn import functional
 from refield.field.nerfacto import NerfactoField
 from refield.field.outlook import Outlook
 from refield.field.radiance import Field, HashField
-from refield.field.render import parted, visible_samples
+from refield.field.render import parted, render_camera, visible_samples
 from refield.field.sampling import OccupancySampler
 from refield.field.source import Source
 from refield.field.volrend import Rendering, Samples, interleaved
@@ -27,6 +28,7 @@ from refield.field.warp import Move, inside_box, leaving, looked_up, moves_of, o
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.inside import in_boxes, spans
+from refield.scene.notebook import SIDE, drawn, facts, strip
 from refield.scene.pose import rotate, transform
 from refield.update.light import Relighting
 from refield.update.region import Region, carved, finer, grown, move_out
@@ -156,6 +158,25 @@ class UpdatedField:
         self._view_of: tuple[Tensor, View] | None = None
         self._changed_of: tuple[Tensor, tuple[OccupancySampler, tuple[Tensor, ...]]] | None = None
         self._marched: tuple[Tensor, ...] = tuple(_by_cells(self.sampler, b) for b in self.boxes) + before
+
+    def __repr__(self) -> str:
+        return f"UpdatedField({self._changed_here}; before: {self.pretrained!r})"
+
+    @property
+    def _changed_here(self) -> str:
+        return ", ".join(f"{count} {kind}" for kind, count in Counter(o.kind for o in self.change.objects).items())
+
+    def _repr_html_(self) -> str:
+        rows: list[tuple[str, object]] = [("this change", self._changed_here), ("before", self.pretrained)]
+        rows += [("note", note) for note in (self.why_stopped, *self.notes) if note]
+        pictures = []
+        for frame in self.change.frames[:1]:
+            camera = frame.camera.within(SIDE * SIDE)
+            for name, field in (("before", self.pretrained), ("after", self)):
+                pictures.append(
+                    (f"{frame.name}, {name}", drawn(render_camera(field, camera, frame.world_from_cam).rgb))
+                )
+        return facts("UpdatedField", rows) + strip(pictures)
 
     @property
     def to_learn(self) -> SceneChange:

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from refield.field.pixels import PixelBank
-from refield.field.radiance import Field
+from refield.field.radiance import Field, check_field
 from refield.field.render import render_many
 from refield.field.sampling import OccupancySampler
 from refield.field.warp import crosses, outline
-from refield.scene.capture import Capture, Frame, Rays, centres
+from refield.scene.capture import Capture, Frame, Rays, centres, check_capture
 from refield.scene.change import SceneChange
+from refield.scene.errors import expect
 from refield.scene.pose import transform
 from refield.update.bare import bare_skin
 from refield.update.composite import UpdatedField
@@ -64,6 +65,9 @@ def update_field(
         NonFiniteError: the helper's loss was not finite for 20 steps in a row before its first look; after one, the
             best state is kept and ``why_stopped`` says so.
     """
+    check_capture(capture)
+    check_field(field)
+    expect("the change", change, SceneChange, "a SceneChange, as refield.estimate_change makes one")
     say = on_stage or (lambda name: None)
     torch.manual_seed(config.seed)
     say("move")

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from refield.commands.clock import Clock
 from refield.estimate.localize import LocalizeConfig, kept_landmarks, known_by, localize_taken, take_in
 from refield.photos.sources import find_sources
 from refield.photos.taken import PhotoConfig, Taken
@@ -14,6 +13,7 @@ from refield.scene.change import PlacedPhoto
 from refield.scene.errors import InputError
 from refield.scene.left_out import named
 from refield.vision.describer import Describer
+from refield.visits.telling import Telling
 from refield.workspace import Workspace
 
 
@@ -30,7 +30,7 @@ class Placing:
 def placed_photos(
     folder: Path,
     workspace: Workspace,
-    clock: Clock,
+    telling: Telling,
     how: Placing = Placing(),
     check: Callable[[Taken], None] | None = None,
 ) -> list[PlacedPhoto]:
@@ -42,10 +42,10 @@ def placed_photos(
         InputError: none can be used, or placed.
     """
     find_sources(folder)  # nothing is made for the sake of photos that are not there
-    clock.stage("localize")
+    telling.stage("localize")
     # as given: what is known of the photos' landmarks is of those poses
     capture, cache = workspace.given_capture(), workspace.cache
-    with clock.counters() as counting:
+    with telling.counters() as counting:
         taken = take_in(folder, cache, how.intake, counting)
         if check is not None:
             for photo in taken.photos:
@@ -58,5 +58,5 @@ def placed_photos(
         what = f"none of its {len(placed)} photos can be placed ({named(rejected)})"
         raise InputError(folder, what, "do they show the scene that was trained, in its light?")
     for line in rejected:
-        clock.warn(f"left out: {line}")
+        telling.warn(f"left out: {line}")
     return placed

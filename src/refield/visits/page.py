@@ -6,18 +6,18 @@ from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
-from refield.commands.clock import Clock
 from refield.evaluate import Report
 from refield.report import Comparison, VisitReport
 from refield.scene.change import SceneChange
 from refield.scene.images import frame_image
+from refield.visits.telling import Telling
 
 
 def page(
     title: str,
     change: SceneChange,
     shown: tuple[Sequence[Tensor], Sequence[Tensor] | None],
-    clock: Clock,
+    telling: Telling,
     evaluation: Report | None,
     facts: Mapping[str, float | str],
 ) -> VisitReport:
@@ -27,11 +27,11 @@ def page(
         title,
         change,
         photos=_photos(change, *shown),
-        seconds=dict(clock.seconds),
+        seconds=dict(telling.seconds),
         evaluation=None if evaluation is None else evaluation.to_dict(),
         evaluation_views=() if evaluation is None else evaluation_views(evaluation),
         facts=dict(facts),
-        warnings=tuple(clock.warnings),
+        warnings=tuple(telling.warnings),
     )
 
 
