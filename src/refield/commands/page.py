@@ -45,6 +45,7 @@ def evaluation_views(evaluation: Report) -> tuple[Comparison, ...]:
             after=None if v.render_before is None else v.render,
             mask_in=v.mask_in,
             mask_out=v.mask_out,
+            frame=v.frame,
         )
         for v in evaluation.views
     )
@@ -66,6 +67,7 @@ def _photos(change: SceneChange, before: Sequence[Tensor], after: Sequence[Tenso
                 mask_in=change.masks_in[used] if change.masks_in else None,
                 mask_out=change.masks_out[used] if change.masks_out else None,
                 unclear=change.unexplained[used] if change.unexplained else None,
+                frame=frame,
             )
         )
         used += 1

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from refield.report import PAGE, link_next
 from refield.scene.errors import InputError
 from refield.workspace import Workspace
 
@@ -28,4 +29,5 @@ def run(options: Undo) -> None:
             what = "has had no visit, so there is nothing to take back"
             raise InputError(options.work, what, f"make one with: refield update {options.work} PHOTOS")
         workspace.drop_last_visit()
+        link_next(workspace.visit(number - 1) / PAGE, None)
     print(f"visit {number} is taken back; {options.work} is as it was after visit {number - 1}")

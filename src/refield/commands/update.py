@@ -22,7 +22,7 @@ from refield.field.render import render_camera
 from refield.history import known_objects, retouched, state
 from refield.photos.sources import find_sources
 from refield.photos.taken import PhotoConfig
-from refield.report import summary, write_contact_sheet, write_report
+from refield.report import PAGE, link_next, summary, write_contact_sheet, write_report
 from refield.scene.capture import Capture
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
@@ -66,7 +66,7 @@ class Visit:
 
     @property
     def html(self) -> Path:
-        return self.folder / "report.html"
+        return self.folder / PAGE
 
     @property
     def sheet(self) -> Path:
@@ -130,9 +130,11 @@ def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | Non
             clock.stop()
             title = f"{options.work.resolve().name}, visit {number + 1}"
             report = page(title, change, (before, after), clock, evaluation, facts or {})
-            write_report(folder, replace(report, world=workspace.world()))
+            report = replace(report, world=workspace.world(), number=number + 1, old_frames=capture.frames)
+            write_report(folder, report)
             if new is not None and report.evaluation_views:
                 write_contact_sheet(folder / SHEET, report.evaluation_views)
+        link_next(workspace.visit(number) / PAGE, number + 1)
     return Visit(workspace.visit(number + 1), change, evaluation)
 
 

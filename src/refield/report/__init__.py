@@ -5,11 +5,14 @@ Built from plain facts and pictures, so that whoever joins the stages decides wh
 
 from refield.report.pictures import write_contact_sheet
 from refield.report.visit import Comparison, VisitReport, object_shift, summary, turn, visit_report_dict
-from refield.report.write import write_report
+from refield.report.write import PAGE, is_our_page, link_next, write_report
 
 __all__ = [
+    "PAGE",
     "Comparison",
     "VisitReport",
+    "is_our_page",
+    "link_next",
     "object_shift",
     "summary",
     "turn",
