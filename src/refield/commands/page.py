@@ -51,7 +51,14 @@ def evaluation_views(evaluation: Report) -> tuple[Comparison, ...]:
     )
 
 
-def _photos(change: SceneChange, before: Sequence[Tensor], after: Sequence[Tensor] | None) -> tuple[Comparison, ...]:
+def marked_photos(change: SceneChange) -> tuple[Comparison, ...]:
+    """The used new photos with what changed in them, without any field's pictures."""
+    return tuple(view for view in _photos(change, None, None) if view.photo is not None)
+
+
+def _photos(
+    change: SceneChange, before: Sequence[Tensor] | None, after: Sequence[Tensor] | None
+) -> tuple[Comparison, ...]:
     out, used = [], 0
     for photo in change.photos:
         frame = photo.frame
@@ -62,7 +69,7 @@ def _photos(change: SceneChange, before: Sequence[Tensor], after: Sequence[Tenso
             Comparison(
                 name=photo.name,
                 photo=frame_image(frame),
-                before=before[used],
+                before=None if before is None else before[used],
                 after=None if after is None else after[used],
                 mask_in=change.masks_in[used] if change.masks_in else None,
                 mask_out=change.masks_out[used] if change.masks_out else None,

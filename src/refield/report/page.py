@@ -57,15 +57,16 @@ def document(title: str, parts: Iterable[str]) -> str:
     )
 
 
-def changed(objects: Sequence[ObjectChange], world: World | None, drawing: str, heading: str = "h2") -> str:
-    """The objects in words, beside the plan."""
-    if not objects:
-        return ""
-    items = "".join(_thing(number, o, world) for number, o in enumerate(objects, 1))
-    figure = f'<figure class="map card">{drawing}<figcaption>{_PLAN_NOTE}</figcaption></figure>' if drawing else ""
-    note = f'<p class="soft">{escape(words.scale_note(world))}</p>'
-    title = f"<{heading}>What changed</{heading}>"
-    return f'{title}<div class="changed"><div><ol class="things card">{items}</ol>{note}</div>{figure}</div>'
+def thing(number: int, o: ObjectChange, world: World | None, again: str = "") -> str:
+    """An item of a list: one object in words, how sure it is, and why; ``again``: a further sentence."""
+    told = [f'<span class="kind {o.kind}">{words.KINDS[o.kind]}</span>, {escape(words.sure(o.confidence))}']
+    around = words.give_or_take(o, world)
+    told += [escape(around)] if around else []
+    why = f'<p class="soft">Why: {escape(o.note)}.</p>' if o.note else ""
+    said = f'<p class="said">{escape(words.sentence(number, o, world))}</p>'
+    badge = f'<b class="no {o.kind}" aria-hidden="true">{number}</b>'
+    more = f"<p>{escape(again)}</p>" if again else ""
+    return f"<li>{badge}{said}<p>{'; '.join(told)}</p>{more}{why}</li>"
 
 
 def _resource(name: str) -> str:
@@ -78,7 +79,7 @@ def _parts(report: VisitReport) -> Iterable[str]:
     yield _warnings(report.warnings)
     cameras = [(f"photo {i}", frame) for i, frame in enumerate(report.change.frames, 1)]
     things = [Thing(str(n), o) for n, o in enumerate(objects, 1)]
-    yield changed(objects, world, plan(things, world, cameras, report.old_frames))
+    yield _changed(objects, world, plan(things, world, cameras, report.old_frames))
     rejected = {p.name for p in report.change.photos if p.status == "rejected"}
     photos = [v for v in report.photos if v.name not in rejected]
     views = report.evaluation_views[:MOST_VIEWS]
@@ -129,14 +130,16 @@ def visit_link(number: int, which: str) -> str:
     return f'<a href="../{number:03d}/report.html">{which}: visit {number}</a>'
 
 
-def _thing(number: int, o: ObjectChange, world: World | None) -> str:
-    told = [f'<span class="kind {o.kind}">{words.KINDS[o.kind]}</span>, {escape(words.sure(o.confidence))}']
-    around = words.give_or_take(o, world)
-    told += [escape(around)] if around else []
-    why = f'<p class="soft">{escape(o.note)}</p>' if o.note else ""
-    said = f'<p class="said">{escape(words.sentence(number, o, world))}</p>'
-    badge = f'<b class="no {o.kind}" aria-hidden="true">{number}</b>'
-    return f"<li>{badge}{said}<p>{'; '.join(told)}</p>{why}</li>"
+def _changed(objects: Sequence[ObjectChange], world: World | None, drawing: str) -> str:
+    """The objects in words, beside the plan."""
+    if not objects:
+        return ""
+    items = "".join(thing(number, o, world) for number, o in enumerate(objects, 1))
+    figure = f'<figure class="map card">{drawing}<figcaption>{_PLAN_NOTE}</figcaption></figure>' if drawing else ""
+    note = f'<p class="soft">{escape(words.scale_note(world))}</p>'
+    return (
+        f'<h2>What changed</h2><div class="changed"><div><ol class="things card">{items}</ol>{note}</div>{figure}</div>'
+    )
 
 
 def _warnings(warnings: Sequence[str]) -> str:

@@ -51,8 +51,8 @@ def shown_size(width: int, height: int, most: float = math.inf) -> tuple[int, in
 def marks_uri(
     mask_in: Tensor | None, mask_out: Tensor | None, unclear: Tensor | None = None, most: float = math.inf
 ) -> str:
-    """What is new, gone and not understood, (H, W) bool each, in colour and outlined, clear elsewhere: to be laid over a
-    photo of that size; as text for an ``img``'s ``src``. Raises ValueError if there is no mask."""
+    """What is new, gone and not understood, (H, W) bool each, in colour and outlined: to be laid over a photo of that
+    size; as text for an ``img``'s ``src``. Raises ValueError if there is no mask."""
     masks = (unclear, UNCLEAR_COLOUR), (mask_in, IN_COLOUR), (mask_out, OUT_COLOUR)
     inked = [(m.detach().cpu(), colour) for m, colour in masks if m is not None]
     if not inked:

@@ -162,7 +162,9 @@ def _camera(name: str, frame: Frame, paper: _Paper) -> str:
     wedge = torch.stack([at, at + ahead * 13 + side * 7, at + ahead * 13 - side * 7])
     corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in wedge.tolist())
     x, y = (at - ahead * 11).tolist()
-    x = min(max(x, 26.0), _WIDTH - 26.0)
+    if abs(float(ahead[0])) > 0.7:  # there is no room for a name behind it
+        x, y = float(at[0]), float(at[1]) + 17
+    x = min(max(x, 28.0), _WIDTH - 28.0)
     text = f'<text x="{x:.1f}" y="{y + 4:.1f}">{escape(name)}</text>' if name else ""
     return f'<polygon class="camera" points="{corners}"/>{text}'
 
@@ -183,7 +185,7 @@ def _old_photos(frames: Sequence[Frame], paper: _Paper) -> list[list[float]]:
         return []
     at = paper.at(torch.stack([f.centre for f in frames[:: max(len(frames) // _MOST_OLD, 1)]]))
     inner = at.new_tensor([_WIDTH, paper.height - _BAR])
-    return at[((at > 3) & (at < inner - 3)).all(1)].tolist()  # type: ignore[no-any-return]
+    return at[((at > 3) & (at < inner - 3)).all(1)].tolist()
 
 
 def _scale_bar(paper: _Paper, world: World) -> str:

@@ -108,7 +108,7 @@ def _pair(title: str, view: Comparison, spots: Sequence[Spot], most: float) -> s
         _half(f"{title}, before: the model from here{_told(then)}", "before", data_uri(view.before, most), then)
         + _half(f"{title}, {right}: {what}{_told(now)}", right, data_uri(after, most), now)
     )  # fmt: skip
-    caption = "The model before and after the update" if view.after is not None else "The model, and the photo"
+    caption = "Before and after" if view.after is not None else "The model and the photo"
     return _figure("pair", f"{title}: before and {right}", caption, halves, view.before)
 
 

@@ -54,7 +54,7 @@ def headline(change: SceneChange) -> str:
     if not change.objects:
         return "Something changed that is not understood" if change.unexplained else "Nothing changed"
     kinds = Counter(o.kind for o in change.objects)
-    parts = []
+    parts: list[str] = []
     for kind in KINDS:
         if kinds[kind]:
             who = _word(kinds[kind]) if parts else counted(kinds[kind], "object")
@@ -140,8 +140,12 @@ def scale_note(world: World | None) -> str:
 
 def date(moment: datetime) -> str:
     """ "3 November 2026, 14:05 UTC"."""
-    zone = moment.tzname() or ""
-    return f"{moment.day} {_MONTHS[moment.month - 1]} {moment.year}, {moment:%H:%M} {zone}".strip()
+    return f"{day(moment)}, {moment:%H:%M} {moment.tzname() or ''}".strip()
+
+
+def day(moment: datetime) -> str:
+    """ "3 November 2026"."""
+    return f"{moment.day} {_MONTHS[moment.month - 1]} {moment.year}"
 
 
 def stage(name: str) -> str:
