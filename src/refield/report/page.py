@@ -15,7 +15,7 @@ from importlib import resources
 from refield.report import words
 from refield.report.plan import Thing, plan
 from refield.report.tables import technical
-from refield.report.views import ALL_PIXELS, LEGEND, MOST_VIEWS, card, pictures_in, spots_in
+from refield.report.views import ALL_PIXELS, MOST_VIEWS, card, legend, pictures_in, spots_in
 from refield.report.visit import Comparison, VisitReport
 from refield.scene.change import ObjectChange
 from refield.scene.world import World
@@ -160,8 +160,7 @@ def _cards(title: str, noun: str, views: Sequence[Comparison], report: VisitRepo
         )
         for i, v in enumerate(views, 1)
     )
-    legend = LEGEND if any(v.marked for v in views) else ""
-    return f"<h2>{escape(title)}</h2>{legend}{shown}" if shown else ""
+    return f"<h2>{escape(title)}</h2>{legend(views)}{shown}" if shown else ""
 
 
 def _rejected(report: VisitReport) -> str:

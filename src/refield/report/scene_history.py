@@ -11,15 +11,16 @@ from refield.report import words
 from refield.report.page import document, thing
 from refield.report.plan import Thing, plan
 from refield.report.tables import table
-from refield.report.views import ALL_PIXELS, LEGEND, card, pictures_in, spots_in
+from refield.report.views import ALL_PIXELS, card, legend, pictures_in, spots_in
 from refield.report.visit import Comparison
 from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.world import World
 
 _MOST_PHOTOS = 4  # of a visit; its own page has them all
+_MOST_CAMERAS = 40  # in the plan
 _PLAN_NOTE = (
     "All visits from above. A number such as 2.1 is object 1 of visit 2. Dashed: where a thing was. Filled: where it "
-    "was after that visit."
+    "was after that visit. Wedges: where new photos were taken; the first of them looks up the page."
 )
 
 
@@ -64,7 +65,8 @@ def _parts(title: str, visits: Sequence[PastVisit], world: World | None) -> Iter
     yield _header(title, visits)
     yield _overview(visits)
     things = [Thing(f"{v.number}.{n}", o) for v in visits for n, o in enumerate(v.change.objects, 1)]
-    drawing = plan(things, world)
+    cameras = [("", frame) for v in visits if v.change.objects for frame in v.change.frames]
+    drawing = plan(things, world, cameras[:_MOST_CAMERAS])
     if drawing:
         note = f"{_PLAN_NOTE} {words.scale_note(world)}"
         yield f'<h2>Plan</h2><figure class="map card">{drawing}<figcaption>{escape(note)}</figcaption></figure>'
@@ -99,7 +101,7 @@ def _overview(visits: Sequence[PastVisit]) -> str:
             f'<tr><th scope="row"><a href="#visit-{v.number}">Visit {v.number}</a></th><td>{when}</td><td>{what}</td>'
             f'<td class="n">{len(v.change.frames)}</td></tr>'
         )
-    heads = ("visit", "when", "what changed", "photos used")
+    heads = ("visit", "when", "what changed", "photos")
     return f'<div class="card">{table("All visits, the first one first", heads, rows, (3,))}</div>'
 
 
@@ -120,11 +122,11 @@ def _visit(visit: PastVisit, world: World | None, known: dict[tuple[int, int], t
         card(f"Photo {i} ({v.name.rpartition('/')[2]})", v, spots_in(v.frame, change.objects, world), most)
         for i, v in enumerate(visit.photos[:_MOST_PHOTOS], 1)
     )
-    legend = LEGEND if photos else ""
+    colours = legend(visit.photos[:_MOST_PHOTOS])
     title = f"Visit {visit.number}: {words.headline(change)}"
     return (
-        f'<section class="visit" id="visit-{visit.number}"><h2>{escape(title)}</h2>{over}{why}{listed}{unclear}{legend}'
-        f'<div class="photos">{photos}</div></section>'
+        f'<section class="visit" id="visit-{visit.number}"><h2>{escape(title)}</h2>{over}{why}{listed}{unclear}'
+        f'{colours}<div class="photos">{photos}</div></section>'
     )
 
 

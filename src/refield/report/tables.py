@@ -125,7 +125,7 @@ def seconds_table(seconds: Mapping[str, float]) -> str:
     rows = []
     for name, s in seconds.items():
         told = escape(stage(name)) + (f" <small>{escape(name)}</small>" if stage(name) != name else "")
-        bar = f'<td><i class="bar" style="width:{100 * max(s, 0) / longest:.1f}%"></i></td>'
+        bar = f'<td class="bar"><i style="width:{100 * max(s, 0) / longest:.1f}%"></i></td>'
         rows.append(_row(told, _n(f"{s:.1f}"), bar))
     rows.append(_row("all together", _n(f"{sum(seconds.values()):.1f}"), "<td></td>", style="all"))
     return table("How long each step took", ("step", "seconds", ""), rows, (1,))

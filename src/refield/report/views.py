@@ -22,11 +22,6 @@ ALL_PIXELS = 10e6
 """of a page's pictures together, about and at most: some 4 MB"""
 MOST_VIEWS = 24
 """that are shown of the views of an evaluation"""
-LEGEND = (
-    '<p class="legend"><span><i class="key in"></i>blue-green: there now</span>'
-    ' <span><i class="key out"></i>orange: no longer there</span>'
-    ' <span><i class="key unclear"></i>violet: changed, not understood</span></p>'
-)
 _EDGE = 5.0  # percent of a picture; badges keep this far from its sides
 _APART = 7.0  # percent; closer badges of one object are shown as one
 
@@ -47,6 +42,17 @@ class Spot:
 def pictures_in(views: Sequence[Comparison]) -> int:
     """How many pictures `card` shows of so many views; for `ALL_PIXELS`."""
     return sum(p is not None for v in views for p in (v.photo, v.before, v.after))
+
+
+def legend(views: Sequence[Comparison]) -> str:
+    """What the colours in these photos say; empty if nothing is marked in any."""
+    keys = (
+        ("in", "blue-green: there now", any(v.mask_in is not None for v in views)),
+        ("out", "orange: no longer there", any(v.mask_out is not None for v in views)),
+        ("unclear", "violet: changed, not understood", any(v.unclear is not None for v in views)),
+    )
+    shown = " ".join(f'<span><i class="key {name}"></i>{told}</span>' for name, told, there in keys if there)
+    return f'<p class="legend">{shown}</p>' if shown else ""
 
 
 def card(title: str, view: Comparison, spots: Sequence[Spot], most: float) -> str:

@@ -186,7 +186,8 @@ def _unit(units: float, world: World | None) -> tuple[str, float, int]:
 
 def _digits(value: float) -> int:
     """Decimals that leave two digits that count."""
-    return 0 if value >= 9.95 else min(1 - math.floor(math.log10(value)), 6) if value > 0 else 0
+    rounded = float(f"{value:.1e}")
+    return 0 if rounded >= 10 or rounded <= 0 else min(1 - math.floor(math.log10(rounded)), 6)
 
 
 def _percent(part: float) -> str:
