@@ -185,8 +185,8 @@ def test_no_change_is_a_report_too(tmp_path: Path) -> None:
     text = "".join(reader.text)
     assert "Nothing changed" in text and "The renders explain the photos." in text
     assert [a["alt"] for t, a in Reader.of(source).tags if t == "img"] == [
-        "Photo 1 (a.png), before: the model from here",
-        "Photo 1 (a.png), photo: the new photo",
+        "Photo 1 (a.png): the model from here",
+        "Photo 1 (a.png): the photo",
     ]
     assert "What changed" not in text and "moved" not in text.replace("no object moved", "")
     told = json.loads((tmp_path / "report.json").read_text())

@@ -207,6 +207,16 @@ def test_the_plan_is_to_scale_and_seen_as_the_first_photo_looks() -> None:
     assert plan([Thing("1", moved())], None) == "" == plan([], UNITS)
 
 
+def test_names_of_photos_do_not_lie_on_each_other() -> None:
+    near = [(f"photo {i}", frame(f"{i}", 0.05 * i)) for i in range(1, 5)]
+    drawing = plan([Thing("1", moved())], UNITS, near)
+    found = re.findall(r'<text x="([\d.]+)" y="([\d.]+)">photo', drawing)
+    places = [(float(x), float(y)) for x, y in found]
+    assert len(places) == 4
+    for i, (x, y) in enumerate(places):
+        assert all(abs(x - a) >= 50 or abs(y - b) >= 12 for a, b in places[:i])
+
+
 def test_visits_link_to_their_neighbours(tmp_path: Path) -> None:
     first = write_report(tmp_path / "001", visit_report(number=1))
     write_report(tmp_path / "002", visit_report(number=2))

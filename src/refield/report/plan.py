@@ -21,7 +21,8 @@ from refield.scene.world import World
 _WIDTH, _MARGIN, _BAR = 420.0, 30.0, 34.0
 _TALLEST, _FLATTEST = 1.1, 0.45  # height over width
 _REACH = 4.0  # times the things' own reach; cameras beyond are drawn at the edge
-_BADGE = 11.0
+_BADGE, _EDGE = 11.0, 18.0
+_NAME = 56.0, 14.0  # room for a photo's name
 _MOST_NAMED, _MOST_OLD = 12, 400
 
 
@@ -65,7 +66,7 @@ def plan(
     parts = [f'<circle class="old-photo" cx="{x:.1f}" cy="{y:.1f}" r="1.6"/>' for x, y in _old_photos(old, paper)]
     parts += [_outlines(t.change, before, after) for t, (before, after) in zip(things, shapes)]
     parts += [_arrow(t.change, paper) for t in things]
-    parts += [_camera(name if len(cameras) <= _MOST_NAMED else "", frame, paper) for name, frame in cameras]
+    parts += _cameras(cameras, paper)
     parts += [_badge(t, paper) for t in things]
     parts.append(_scale_bar(paper, world))
     said = " ".join(f"{t.label}: {words.KINDS[t.change.kind]}." for t in things)
@@ -130,8 +131,7 @@ def _outlines(o: ObjectChange, before: Tensor | None, after: Tensor | None) -> s
     parts = []
     for shape, style in ((before, "was"), (after, "is")):
         if shape is not None:
-            corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in shape.tolist())
-            parts.append(f'<polygon class="{style} {o.kind}" points="{corners}"/>')
+            parts.append(_polygon(f"{style} {o.kind}", shape))
     return "".join(parts)
 
 
@@ -146,27 +146,44 @@ def _arrow(o: ObjectChange, paper: _Paper) -> str:
     way = way / far
     tip = end - way * (_BADGE + 3)
     neck, side = tip - way * 9, torch.stack([-way[1], way[0]]) * 5
-    head = " ".join(f"{x:.1f},{y:.1f}" for x, y in torch.stack([tip, neck + side, neck - side]).tolist())
+    head = _polygon("head", torch.stack([tip, neck + side, neck - side]))
     (x0, y0), (x1, y1) = start.tolist(), neck.tolist()
     line = f'<line class="way" x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"/>'
-    return f'<circle class="from" cx="{x0:.1f}" cy="{y0:.1f}" r="3"/>{line}<polygon class="head" points="{head}"/>'
+    return f'<circle class="from" cx="{x0:.1f}" cy="{y0:.1f}" r="3"/>{line}{head}'
 
 
-def _camera(name: str, frame: Frame, paper: _Paper) -> str:
+def _cameras(cameras: Sequence[tuple[str, Frame]], paper: _Paper) -> list[str]:
+    """Wedges that open to where photos look, with their names beside them unless they are many."""
+    wedges, texts = [], []
+    taken: list[tuple[float, float]] = []
+    for name, frame in cameras:
+        at, ahead = _stands(frame, paper)
+        side = torch.stack([-ahead[1], ahead[0]])
+        wedges.append(_polygon("camera", torch.stack([at, at + ahead * 13 + side * 7, at + ahead * 13 - side * 7])))
+        if not name or len(cameras) > _MOST_NAMED:
+            continue
+        x, y = (at - ahead * 11).tolist()
+        if abs(float(ahead[0])) > 0.7:  # there is no room for a name behind it
+            x, y = float(at[0]), float(at[1]) + 17
+        x, y = min(max(x, _NAME[0] / 2), _WIDTH - _NAME[0] / 2), y + 4
+        while any(abs(x - a) < _NAME[0] and abs(y - b) < _NAME[1] for a, b in taken):
+            y += _NAME[1]
+        taken.append((x, y))
+        texts.append(f'<text x="{x:.1f}" y="{y:.1f}">{escape(name)}</text>')
+    return wedges + texts
+
+
+def _stands(frame: Frame, paper: _Paper) -> tuple[Tensor, Tensor]:
+    """Where a camera is drawn, at the edge if it is further away, and which way it looks there (unit)."""
     at = paper.at(frame.centre)
     ahead = paper.at(frame.centre + frame.world_from_cam[:3, 2].double()) - at
-    ahead = ahead / ahead.norm().clamp_min(1e-9)
     limit = at.new_tensor([_WIDTH, paper.height - _BAR])
-    at = torch.minimum(at.clamp_min(_MARGIN * 0.6), limit - _MARGIN * 0.6)
-    side = torch.stack([-ahead[1], ahead[0]])
-    wedge = torch.stack([at, at + ahead * 13 + side * 7, at + ahead * 13 - side * 7])
-    corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in wedge.tolist())
-    x, y = (at - ahead * 11).tolist()
-    if abs(float(ahead[0])) > 0.7:  # there is no room for a name behind it
-        x, y = float(at[0]), float(at[1]) + 17
-    x = min(max(x, 28.0), _WIDTH - 28.0)
-    text = f'<text x="{x:.1f}" y="{y + 4:.1f}">{escape(name)}</text>' if name else ""
-    return f'<polygon class="camera" points="{corners}"/>{text}'
+    return torch.minimum(at.clamp_min(_EDGE), limit - _EDGE), ahead / ahead.norm().clamp_min(1e-9)
+
+
+def _polygon(style: str, corners: Tensor) -> str:
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners.tolist())
+    return f'<polygon class="{style}" points="{points}"/>'
 
 
 def _badge(thing: Thing, paper: _Paper) -> str:

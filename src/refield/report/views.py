@@ -105,17 +105,17 @@ def _pair(title: str, view: Comparison, spots: Sequence[Spot], most: float) -> s
     """The picture before and the one after; without an update the photo takes the place of the latter."""
     if view.before is None or (view.after is None and view.photo is None):
         return ""
-    after = view.photo if view.after is None else view.after
-    assert after is not None
     then, now = [s for s in spots if not s.now], [s for s in spots if s.now]
-    right = "after" if view.after is not None else "photo"
-    what = "the updated model from here" if view.after is not None else "the new photo"
-    halves = (
-        _half(f"{title}, before: the model from here{_told(then)}", "before", data_uri(view.before, most), then)
-        + _half(f"{title}, {right}: {what}{_told(now)}", right, data_uri(after, most), now)
-    )  # fmt: skip
-    caption = "Before and after" if view.after is not None else "The model and the photo"
-    return _figure("pair", f"{title}: before and {right}", caption, halves, view.before)
+    if view.after is not None:
+        after, ends, caption = view.after, ("before", "after"), "Before and after"
+        alts = f"{title}, before: the model from here", f"{title}, after: the updated model from here"
+    else:
+        assert view.photo is not None
+        after, ends, caption = view.photo, ("model", "photo"), "The model and the photo"
+        alts = f"{title}: the model from here", f"{title}: the photo"
+    halves = _half(alts[0] + _told(then), ends[0], data_uri(view.before, most), then)
+    halves += _half(alts[1] + _told(now), ends[1], data_uri(after, most), now)
+    return _figure("pair", f"{title}: {ends[0]} and {ends[1]}", caption, halves, view.before)
 
 
 def _half(alt: str, name: str, source: str, spots: Sequence[Spot]) -> str:

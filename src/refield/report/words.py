@@ -166,7 +166,7 @@ def up_of(world: World | None) -> Tensor:
 
 def degrees(angle: float) -> str:
     """ "40°", "2.5°", "0.08°"."""
-    return f"{angle:.{_digits(angle)}f}°"
+    return f"{angle:.{min(_digits(angle), 2)}f}°"
 
 
 def _word(number: int) -> str:
