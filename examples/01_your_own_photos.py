@@ -42,6 +42,7 @@ def main(before: Path, after: Path, out: Path) -> None:
             photo=frame_image(frame),
             before=refield.render_frame(field, frame).rgb,
             after=refield.render_frame(updated, frame).rgb,
+            frame=frame,
         )
         for frame in change.frames
     )

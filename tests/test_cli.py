@@ -184,6 +184,42 @@ def test_updates_stack(place, monkeypatch, capsys):
     assert main(["evaluate", "work", "new", "--visit", "1"]) == 0
 
 
+def test_reports_link_to_each_other_and_the_history_to_all(place, monkeypatch, capsys):
+    assert main(["report", "work"]) == 2
+    assert "has had no visit yet" in capsys.readouterr().err
+    believing(monkeypatch, "moved", "removed")
+    assert main(["update", "work", "new", *FEW]) == 0
+    first = contents(place / "work")
+    believing(monkeypatch)
+    assert main(["update", "work", "new"]) == 0
+    one, two = (place / f"work/visits/00{n}/report.html" for n in (1, 2))
+    assert 'href="../002/report.html"' in one.read_text() and 'href="../001/report.html"' in two.read_text()
+    assert "Two objects" not in two.read_text() and "One object moved, one is gone" in one.read_text()
+    capsys.readouterr()
+
+    assert main(["report", "work"]) == 0
+    assert capsys.readouterr().out == "report: work/report.html\n"
+    history = (place / "work/report.html").read_text()
+    for told in ("Visit 1: One object moved, one is gone", "Visit 2: Nothing changed", "Object 2, a thing of"):
+        assert told in history
+    assert 'href="visits/001/report.html"' in history and history.count('<article class="card">') == 3
+    assert main(["report", "work", "--out", "my pages/history.html"]) == 0
+    assert 'href="../work/visits/002/report.html"' in (place / "my pages/history.html").read_text()
+
+    for out, why in (
+        ("data/transforms.json", "not made by refield"),
+        ("data", "a folder"),
+        ("work/field/x", "belongs"),
+    ):
+        kept = contents(place)
+        assert main(["report", "work", "--out", out]) == 2
+        assert why in capsys.readouterr().err and contents(place) == kept
+    assert main(["report", "work"]) == 0  # our own page may be replaced
+    (place / "work/report.html").unlink()
+    assert main(["undo", "work"]) == 0
+    assert contents(place / "work") == first
+
+
 def test_the_other_architecture_all_the_way(place, monkeypatch, capsys):
     """NeRFacto's: trained, kept, updated and rendered by the same commands."""
     shape = ["samples", "4", "levels", "2", "finest", "32", "log2-table", "8", "width", "8", "occupancy", "16"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 import json
 import math
@@ -26,14 +27,14 @@ from refield.report import (
     write_report,
 )
 from refield.report.page import html_page
-from refield.report.pictures import IN_COLOUR, OUT_COLOUR, data_uri, with_masks
+from refield.report.pictures import IN_COLOUR, OUT_COLOUR, data_uri, marks_uri
 from refield.report.visit import object_shift, turn, uncertainty
 from refield.scene import pose
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
+from tests.visit_pages import EVIL, visit_report
 
-EVIL = "<script>alert('&\"x')</script>"
 MOVE = pose.exp(torch.tensor([0.3, 0.0, 0.1, 0.0, 0.0, math.radians(30)], dtype=torch.float64))
 
 
@@ -61,27 +62,6 @@ def view(name: str, **more: object) -> Comparison:
     return replace(Comparison(name, picture(0), picture(1), picture(2)), **more)  # type: ignore[arg-type]
 
 
-def full_report() -> VisitReport:
-    mask = torch.zeros(20, 30, dtype=torch.bool)
-    mask[4:9, 4:9] = True
-    objects = (moved(note=EVIL), ObjectChange("removed", grid()), ObjectChange("added", grid()))
-    change = SceneChange(objects, (photo("a.png"), photo(EVIL, used=False)), why=f"because {EVIL}")
-    scores = {"psnr": 30.0, "psnr_in": 27.123, "psnr_out": None, "ssim_in": 0.912}
-    old = {"psnr": 25.0, "psnr_in": 12.5, "psnr_out": None, "ssim_in": 0.5}
-    told = {"pooled": scores, "mean": scores, "pooled_before": old, "mean_before": old}
-    told["views"] = [{"name": EVIL, "scores": scores, "before": old}]
-    return VisitReport(
-        title=EVIL,
-        change=change,
-        photos=(view("a.png", mask_in=mask, mask_out=~mask), Comparison(EVIL, None)),
-        seconds={"detect": 1.25, EVIL: 3.5},
-        evaluation=told,
-        evaluation_views=(view(EVIL),),
-        facts={"held-out PSNR": 31.234, EVIL: EVIL},
-        warnings=(EVIL,),
-    )
-
-
 class Reader(HTMLParser):
     """Collects what a browser would see, and checks that tags nest."""
 
@@ -92,6 +72,13 @@ class Reader(HTMLParser):
         self.open: list[str] = []
         self.text: list[str] = []
         self.tags: list[tuple[str, dict[str, str | None]]] = []
+
+    @staticmethod
+    def of(source: str) -> Reader:
+        reader = Reader()
+        reader.feed(source)
+        assert not reader.open
+        return reader
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
@@ -109,47 +96,55 @@ class Reader(HTMLParser):
 
 def read(report: VisitReport, folder: Path) -> tuple[str, Reader]:
     source = write_report(folder, report).read_text(encoding="utf-8")
-    reader = Reader()
-    reader.feed(source)
-    assert not reader.open
-    return source, reader
+    return source, Reader.of(source)
 
 
 def test_the_page_holds_everything_it_is_given(tmp_path: Path) -> None:
-    _, reader = read(full_report(), tmp_path / "visit")
+    _, reader = read(visit_report(), tmp_path / "visit")
     text = " ".join(" ".join(reader.text).split())
     for told in (
-        "3 objects changed: 1 moved, 1 removed, 1 added; seen in 1 new photo (1 rejected).", "because",
-        "only 7 inliers", "30.00°", "27.12", "12.50", "0.912", "31.23", "1.2", "detect", "torch",
+        "One object moved, one is gone, one is new", "7 March 2026, 09:05 UTC", "2 new photos", "Part of what changed",
+        "because", "only 7 inliers", "30.00°", "27.12", "12.50", "0.912", "31.23", "1.2", "torch", "part of it",
+        "Comparing the new photos with the model", "detect", "Making the model from 63 photos", "violet", "24.8",
     ):  # fmt: skip
         assert told in text, told
     pictures = [a["src"] for t, a in reader.tags if t == "img"]
-    assert len(pictures) == 2 + 4 + 3  # the slider, the new photo with its masks, the evaluation view
+    assert len(pictures) == 2 * (2 + 2) + 3  # before and after, the photo and its marks; the evaluation view has none
 
 
-def test_nothing_is_fetched_and_nothing_runs_but_our_line(tmp_path: Path) -> None:
-    source, reader = read(full_report(), tmp_path)
-    assert sum(tag == "script" for tag, _ in reader.tags) == 1
+def test_nothing_is_fetched_and_nothing_runs_but_our_script(tmp_path: Path) -> None:
+    source, reader = read(visit_report(), tmp_path)
+    (script,) = re.findall(r"<script>(.*?)</script>", source, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in source and "default-src 'none'" in source
     for tag, attributes in reader.tags:
         for key, value in attributes.items():
             assert not key.startswith("on"), (tag, key)
-            if key in ("src", "href", "data", "action"):
+            if key in ("src", "data", "action"):
                 assert value is not None and value.startswith("data:image/"), (tag, value)
-    assert not re.search(r"(https?:)?//\w|@import|url\(", re.sub(r"base64,[\w+/=]+", "", source))
-    assert "default-src 'none'" in source
+    links = [a["href"] for t, a in reader.tags if t == "a"]
+    assert links == ["../001/report.html", "change.json", "report.json"]
+    assert not re.search(r"(https?:)?//\w|@import|url\(", re.sub(r"base64,[\w+/=]+", "", source.replace(script, "")))
+    assert not re.search(r"https?:|fetch|import|eval|innerHTML", script)
 
 
 def test_text_from_outside_is_shown_not_obeyed(tmp_path: Path) -> None:
-    source, reader = read(full_report(), tmp_path)
+    source, reader = read(visit_report(), tmp_path)
     assert "alert" in source and "<script>alert" not in source
     assert any(EVIL in piece for piece in reader.text)
 
 
 def test_the_pictures_are_the_pictures(tmp_path: Path) -> None:
-    _, reader = read(full_report(), tmp_path)
+    report = VisitReport("w", SceneChange(photos=(photo("a.png"),)), photos=(view("a.png"),))
+    _, reader = read(report, tmp_path)
     sources = {a["alt"]: a["src"] or "" for t, a in reader.tags if t == "img"}
-    decoded = Image.open(io.BytesIO(base64.b64decode(sources["a.png: new photo"].split(",")[1])))
+    decoded = Image.open(io.BytesIO(base64.b64decode(sources["Photo 1 (a.png): the photo"].split(",")[1])))
     assert (np.asarray(decoded) == (picture(0) * 255).round().to(torch.uint8).numpy()).all()
+
+
+def pictures_of(reader: Reader) -> list[Image.Image]:
+    uris = [a["src"] or "" for t, a in reader.tags if t == "img"]
+    return [Image.open(io.BytesIO(base64.b64decode(u.split(",")[1]))) for u in uris]
 
 
 def test_large_pictures_are_scaled_and_compressed() -> None:
@@ -158,15 +153,30 @@ def test_large_pictures_are_scaled_and_compressed() -> None:
     assert uri.startswith("data:image/jpeg") and decoded.size == (960, 540)
 
 
-def test_masks_are_drawn_in_their_colours() -> None:
+def test_a_page_has_a_bounded_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many photos there are: their pixels are shared out, and not all views of an evaluation are shown."""
+    monkeypatch.setattr("refield.report.page.ALL_PIXELS", 20_000)
+    monkeypatch.setattr("refield.report.page.MOST_VIEWS", 5)
+    large = Comparison("x", *(torch.rand(100, 150, 3) for _ in range(3)), mask_in=torch.ones(100, 150) > 0)
+    views = tuple(replace(large, name=f"{i}.png") for i in range(8))
+    photos = tuple(photo(f"{i}.png") for i in range(8))
+    _, reader = read(VisitReport("w", SceneChange(photos=photos), photos=views, evaluation_views=views), tmp_path)
+    shown = pictures_of(reader)
+    assert len(shown) == (8 + 5) * 4  # the marks lie over the photo with the same size
+    assert sum(p.width * p.height for p in shown) * 3 / 4 == pytest.approx(20_000, rel=0.1)
+
+
+def test_marks_are_drawn_in_their_colours_over_nothing() -> None:
     mask_in, mask_out = torch.zeros(2, 20, 30, dtype=torch.bool)
     mask_in[2:8, 2:8] = True
     mask_out[10:16, 20:26] = True
-    out = (with_masks(picture(0), mask_in, mask_out) * 255).round()
-    assert out[2, 2].tolist() == list(IN_COLOUR) and out[10, 20].tolist() == list(OUT_COLOUR)
-    assert (out[5, 5] - (picture(0)[5, 5] * 255 + torch.tensor(IN_COLOUR)) / 2).abs().max() <= 1
-    plain = out[18, 28]
-    assert plain.max() == plain.min()  # grey elsewhere
+    uri = marks_uri(mask_in, mask_out)
+    drawn = np.asarray(Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1]))).convert("RGBA"))
+    assert drawn[2, 2].tolist() == [*IN_COLOUR, 255] and drawn[10, 20].tolist() == [*OUT_COLOUR, 255]
+    assert drawn[5, 5, :3].tolist() == list(IN_COLOUR) and 80 < drawn[5, 5, 3] < 150
+    assert drawn[18, 28, 3] == 0
+    with pytest.raises(ValueError, match="no mask"):
+        marks_uri(None, None)
 
 
 def test_no_change_is_a_report_too(tmp_path: Path) -> None:
@@ -174,21 +184,26 @@ def test_no_change_is_a_report_too(tmp_path: Path) -> None:
     source, reader = read(VisitReport("w, visit 1", change, photos=(view("a.png", after=None),)), tmp_path)
     text = "".join(reader.text)
     assert "Nothing changed" in text and "The renders explain the photos." in text
-    assert "updated" not in text and '<div class="slide"' not in source
+    assert [a["alt"] for t, a in Reader.of(source).tags if t == "img"] == [
+        "Photo 1 (a.png): the model from here",
+        "Photo 1 (a.png): the photo",
+    ]
+    assert "What changed" not in text and "moved" not in text.replace("no object moved", "")
     told = json.loads((tmp_path / "report.json").read_text())
     assert told["objects"] == [] and told["evaluation"] is None
 
 
 def test_report_json_tells_the_same(tmp_path: Path) -> None:
-    report = replace(full_report(), facts={"psnr": math.nan})
+    report = replace(visit_report(), facts={"psnr": math.nan})
     write_report(tmp_path, report)
     told = json.loads((tmp_path / "report.json").read_text())
     assert told == json.loads(json.dumps(visit_report_dict(report), allow_nan=False))
     assert told["facts"] == {"psnr": None}
     assert [o["kind"] for o in told["objects"]] == ["moved", "removed", "added"]
     assert told["objects"][0]["angle_deg"] == pytest.approx(30)
+    assert told["made"] == "2026-03-07T09:05:00+00:00"
     assert told["objects"][1]["new_from_old"] is None
-    assert told["photos"][1] == {"file": EVIL, "status": "rejected", "why": "only 7 inliers"}
+    assert told["photos"][2] == {"file": EVIL, "status": "rejected", "why": "only 7 inliers"}
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ COMMANDS = {
     "train": "photos, with camera poses or without → a field in a workspace",
     "update": "a few new photos → what changed, and the field brought up to date",
     "visits": "what changed at each update of a workspace",
+    "report": "the scene's history, all visits on one page",
     "undo": "take the last update back",
     "render": "pictures from any camera, before or after",
     "evaluate": "PSNR and SSIM on photos the field has never seen",

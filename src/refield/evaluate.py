@@ -80,6 +80,8 @@ class ViewReport:
     mask_in: Tensor | None = field(repr=False, compare=False)
     """(H, W) bool"""
     mask_out: Tensor | None = field(repr=False, compare=False)
+    frame: Frame | None = field(default=None, repr=False, compare=False)
+    """where it was taken"""
 
 
 @dataclass(frozen=True)
@@ -217,6 +219,7 @@ def _view(new: Field, old: Field | None, folder: Path, frame: Frame, config: Eva
         render_before=None if old is None else _rendered(old, frame, truth, config),
         mask_in=mask_in,
         mask_out=mask_out,
+        frame=frame,
     )
 
 

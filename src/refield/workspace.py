@@ -314,9 +314,11 @@ class Workspace:
         save_change(folder, kept)
         return kept
 
-    def change(self, number: int, capture: Capture | None = None, *, masks: bool = True) -> SceneChange:
+    def change(
+        self, number: int, capture: Capture | None = None, *, masks: bool = True, old_masks: bool = True
+    ) -> SceneChange:
         """What changed at a visit; see `load_change`."""
-        return load_change(self.visit(number), capture, masks=masks)
+        return load_change(self.visit(number), capture, masks=masks, old_masks=old_masks)
 
 
 def _copy_photos(folder: Path, frames: Sequence[Frame]) -> tuple[Frame, ...]:

@@ -60,7 +60,7 @@ def concluded(scene: Told, settled: Settled) -> SceneChange:
             ObjectChange("added", grid, masks_in=segment.masks_in(frames, grid), confidence=share, note=note)
         )
     left = _unexplained(scene, settled)
-    reasons = [f"1 {c.note}" if c.kind == "moved" else f"1 {c.kind}: {c.note}" for c in changes]
+    reasons = [f"1 {c.kind}{_by(c)}: {c.note}" for c in changes]
     reasons += [_said_of(scene, left)] if left else []
     if not reasons:
         reasons = ["some pixels differ, but no object that moved, left or arrived explains them better than before"]
@@ -91,7 +91,7 @@ def _moved(frames: Sequence[Frame], old: Old, change: PoseChange) -> ObjectChang
         confidence=change.explained,
         covariance=about @ change.covariance @ about.T,
     )
-    return replace(moved, note=_why_moved(moved, change))
+    return replace(moved, note=_why_moved(change))
 
 
 def _masks_of(frames: Sequence[Frame], old: Old) -> tuple[Tensor | None, ...]:
@@ -99,14 +99,18 @@ def _masks_of(frames: Sequence[Frame], old: Old) -> tuple[Tensor | None, ...]:
     return segment.masks_in(frames, old.shape) if old.remembered else segment.masks_out(frames, old)
 
 
-def _why_moved(moved: ObjectChange, change: PoseChange) -> str:
-    assert moved.shift is not None
-    shift = float(moved.shift.norm())
-    turn = float(angle_between(change.new_from_old, torch.eye(4, dtype=torch.float64)))
+def _why_moved(change: PoseChange) -> str:
     return (
-        f"moved by {shift:.4g} and turned by {turn:.0f} degrees, {100 * change.explained:.0f} % of its pixels show it"
-        f" at its new place, {100 * change.before:.0f} % what was there before"
+        f"{100 * change.explained:.0f} % of its pixels show it at its new place, {100 * change.before:.0f} % what was"
+        " there before"
     ) + (f"; {change.note}" if change.note else "")
+
+
+def _by(o: ObjectChange) -> str:
+    if o.new_from_old is None or o.shift is None:
+        return ""
+    turn = float(angle_between(o.new_from_old, torch.eye(4, dtype=torch.float64)))
+    return f" by {float(o.shift.norm()):.4g} and turned by {turn:.0f} degrees"
 
 
 def _fresh(settled: Settled, lattice: Lattice, part: Voxels) -> float:

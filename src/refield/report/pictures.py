@@ -1,9 +1,10 @@
-"""Pictures for the page: data URIs, change masks laid over a photo, the before/after sheet."""
+"""Pictures for the page: data URIs, change masks to be laid over a photo, the before/after sheet."""
 
 from __future__ import annotations
 
 import base64
 import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,33 +22,64 @@ IN_COLOUR, OUT_COLOUR, UNCLEAR_COLOUR = (
     (147, 51, 234),
 )  # told apart by colour-blind eyes too, unlike green and red
 WIDEST = 960  # pixels of a picture on the page
-_PNG_PIXELS = 256 * 256  # larger pictures are inlined as JPEG
+_QUALITY = 88
+_PNG_PIXELS = 64 * 64  # larger pictures are inlined as JPEG
+_FILL = 0.45  # opacity of what is marked; its outline is opaque
 _GAP, _CAPTION = 8, 22
 
 
-def data_uri(image: Tensor) -> str:
-    """A picture (H, W, 3), uint8 or float in [0, 1], as text for an ``img``'s ``src``."""
+def data_uri(image: Tensor, most: float = math.inf) -> str:
+    """A picture (H, W, 3), uint8 or float in [0, 1], as text for an ``img``'s ``src``; of so many pixels at most."""
     picture = _picture(image)
-    if picture.width > WIDEST:
-        picture = picture.resize((WIDEST, round(picture.height * WIDEST / picture.width)), Image.Resampling.LANCZOS)
-    kind = "PNG" if picture.width * picture.height <= _PNG_PIXELS else "JPEG"
+    size = shown_size(picture.width, picture.height, most)
+    if size != picture.size:
+        picture = picture.resize(size, Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
-    picture.save(buffer, kind, **({} if kind == "PNG" else {"quality": 90}))
-    return f"data:image/{kind.lower()};base64,{base64.b64encode(buffer.getvalue()).decode()}"
+    if picture.width * picture.height <= _PNG_PIXELS:
+        picture.save(buffer, "PNG")
+        return _uri("png", buffer)
+    picture.save(buffer, "JPEG", quality=_QUALITY, subsampling=0)
+    return _uri("jpeg", buffer)
 
 
-def with_masks(photo: Tensor, mask_in: Tensor | None, mask_out: Tensor | None, unclear: Tensor | None = None) -> Tensor:
-    """The photo in pale grey with what is new, gone and not understood in colour and outlined; (H, W, 3) float."""
-    image = _unit(photo)
-    grey = (image @ torch.tensor([0.299, 0.587, 0.114]))[..., None]
-    out = (0.75 * grey + 0.25).expand(*image.shape).clone()
+def shown_size(width: int, height: int, most: float = math.inf) -> tuple[int, int]:
+    """The (width, height) in which a picture is put on the page."""
+    part = min(1.0, WIDEST / width, math.sqrt(most / (width * height)))
+    return max(round(width * part), 1), max(round(height * part), 1)
+
+
+def marks_uri(
+    mask_in: Tensor | None, mask_out: Tensor | None, unclear: Tensor | None = None, most: float = math.inf
+) -> str:
+    """What is new, gone and not understood, (H, W) bool each, in colour and outlined: to be laid over a photo of that
+    size; as text for an ``img``'s ``src``. Raises ValueError if there is no mask."""
     masks = (unclear, UNCLEAR_COLOUR), (mask_in, IN_COLOUR), (mask_out, OUT_COLOUR)
-    inked = [(m, torch.tensor(c) / 255) for m, c in masks if m is not None]
-    for mask, ink in inked:
-        out[mask] = 0.5 * image[mask] + 0.5 * ink
-    for mask, ink in inked:
-        out[_outline(mask)] = ink
-    return out
+    inked = [(m.detach().cpu(), colour) for m, colour in masks if m is not None]
+    if not inked:
+        raise ValueError("there is no mask to show")
+    height, width = inked[0][0].shape
+    size = shown_size(width, height, most)
+    small = [(_resized(m, size), torch.tensor(colour, dtype=torch.uint8)) for m, colour in inked]
+    out = torch.zeros(size[1], size[0], 4, dtype=torch.uint8)
+    for mask, ink in small:
+        out[mask] = torch.cat([ink, torch.tensor([round(255 * _FILL)], dtype=torch.uint8)])
+    for mask, ink in small:
+        out[_outline(mask)] = torch.cat([ink, torch.tensor([255], dtype=torch.uint8)])
+    buffer = io.BytesIO()
+    Image.fromarray(out.numpy(), "RGBA").save(buffer, "PNG", optimize=True)
+    return _uri("png", buffer)
+
+
+def _uri(kind: str, buffer: io.BytesIO) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def _resized(mask: Tensor, size: tuple[int, int]) -> Tensor:
+    """(H, W) bool at another (width, height)."""
+    if (mask.shape[1], mask.shape[0]) == size:
+        return mask
+    scaled = functional.interpolate(mask[None, None].float(), (size[1], size[0]), mode="area")
+    return scaled[0, 0] > 0.5
 
 
 def write_contact_sheet(path: Path | str, views: Sequence[Comparison], height: int = 240) -> Path:

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from refield.scene.capture import Frame
 from refield.scene.change import ObjectChange, PlacedPhoto, SceneChange
 from refield.scene.pose import rotation_log, skew, transform
 from refield.scene.world import World
@@ -48,11 +49,17 @@ class Comparison:
     """(H, W) bool: changed pixels where something used to be"""
     unclear: Tensor | None = None
     """(H, W) bool: changed pixels that are not understood"""
+    frame: Frame | None = None
+    """where it was taken, so that objects are numbered in it; None: they are not"""
 
     @property
     def marked(self) -> bool:
         """Whether any mask is known."""
         return any(m is not None for m in (self.mask_in, self.mask_out, self.unclear))
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)
 
 
 @dataclass(frozen=True)
@@ -78,6 +85,13 @@ class VisitReport:
     """how large the scene is, and a unit; lengths are then told as a part of the scene, and in metres"""
     versions: Mapping[str, str] = field(default_factory=versions)
     """of Python and the packages"""
+    number: int | None = None
+    """the visit's, from 1; the page then lies in a workspace, with ``change.json`` beside it and its neighbours'
+    pages next to its folder, and links to them"""
+    made: datetime = field(default_factory=_now)
+    """when, with its time zone"""
+    old_frames: tuple[Frame, ...] = ()
+    """of the old photos: where they were taken, for the plan"""
 
 
 def turn(new_from_old: Tensor) -> tuple[float, list[float]]:
@@ -128,7 +142,7 @@ def visit_report_dict(report: VisitReport) -> dict[str, Any]:
     """The content of ``report.json``: everything but the pictures; only what JSON can hold (no NaN)."""
     return {
         "title": report.title,
-        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+        "made": report.made.isoformat(timespec="seconds"),
         "summary": summary(report.change),
         "why": report.change.why,
         "world": None if report.world is None else report.world.to_dict(),

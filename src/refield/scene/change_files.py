@@ -47,13 +47,18 @@ def save_change(folder: AnyPath, change: SceneChange) -> None:
 
 
 def load_change(
-    folder: AnyPath, capture: Capture | None = None, *, photos: Sequence[Frame] = (), masks: bool = True
+    folder: AnyPath,
+    capture: Capture | None = None,
+    *,
+    photos: Sequence[Frame] = (),
+    masks: bool = True,
+    old_masks: bool = True,
 ) -> SceneChange:
     """Read what `save_change` wrote.
 
     With ``capture`` the masks are checked against its training frames. ``photos`` stand in, by name, for used
     photos whose image does not lie in ``folder``. Without ``masks`` there are none: reading them takes longest, and
-    whoever renders the field asks for none.
+    whoever renders the field asks for none. Without ``old_masks`` there are only those of the new photos.
 
     Raises:
         InputError: a file or key is missing, or holds what it cannot.
@@ -62,7 +67,7 @@ def load_change(
     record = read_json(folder / NAME)
     try:
         return SceneChange(
-            objects=tuple(_object_in(folder, o, capture, masks) for o in record["objects"]),
+            objects=tuple(_object_in(folder, o, capture, masks and old_masks) for o in record["objects"]),
             photos=tuple(_photo_in(folder, p, {f.name: f for f in photos}) for p in record["photos"]),
             why=str(record.get("why", "")),
             **{kind: _photo_masks(folder, record.get(kind, []), masks) for kind in _PHOTO_MASKS},

@@ -17,7 +17,7 @@ from refield.field.render import render_camera
 from refield.history import known_objects, retouched, state
 from refield.photos.sources import find_sources
 from refield.photos.taken import PhotoConfig
-from refield.report import write_contact_sheet, write_report
+from refield.report import PAGE, link_next, write_contact_sheet, write_report
 from refield.scene.capture import Capture, Frame, check_frames
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
@@ -108,9 +108,11 @@ def make_visit(
             telling.stop()
             title = f"{workspace.path.resolve().name}, visit {number + 1}"
             report = page(title, change, (before, after), telling, measured, facts or {})
-            write_report(folder, replace(report, world=workspace.world()))
+            report = replace(report, world=workspace.world(), number=number + 1, old_frames=capture.frames)
+            write_report(folder, report)
             if new is not None and report.evaluation_views:
                 write_contact_sheet(folder / SHEET, report.evaluation_views)
+        link_next(workspace.visit(number) / PAGE, number + 1)
     return Visit(number + 1, workspace.visit(number + 1), change, measured)
 
 
@@ -126,6 +128,7 @@ def take_back(workspace: Workspace) -> int:
             what = "has had no visit, so there is nothing to take back"
             raise InputError(workspace.path, what, f"make one with: refield update {workspace.path} PHOTOS")
         workspace.drop_last_visit()
+        link_next(workspace.visit(number - 1) / PAGE, None)
     return number
 
 

@@ -45,12 +45,20 @@ def evaluation_views(evaluation: Report) -> tuple[Comparison, ...]:
             after=None if v.render_before is None else v.render,
             mask_in=v.mask_in,
             mask_out=v.mask_out,
+            frame=v.frame,
         )
         for v in evaluation.views
     )
 
 
-def _photos(change: SceneChange, before: Sequence[Tensor], after: Sequence[Tensor] | None) -> tuple[Comparison, ...]:
+def marked_photos(change: SceneChange) -> tuple[Comparison, ...]:
+    """The used new photos with what changed in them, without any field's pictures."""
+    return tuple(view for view in _photos(change, None, None) if view.photo is not None)
+
+
+def _photos(
+    change: SceneChange, before: Sequence[Tensor] | None, after: Sequence[Tensor] | None
+) -> tuple[Comparison, ...]:
     out, used = [], 0
     for photo in change.photos:
         frame = photo.frame
@@ -61,11 +69,12 @@ def _photos(change: SceneChange, before: Sequence[Tensor], after: Sequence[Tenso
             Comparison(
                 name=photo.name,
                 photo=frame_image(frame),
-                before=before[used],
+                before=None if before is None else before[used],
                 after=None if after is None else after[used],
                 mask_in=change.masks_in[used] if change.masks_in else None,
                 mask_out=change.masks_out[used] if change.masks_out else None,
                 unclear=change.unexplained[used] if change.unexplained else None,
+                frame=frame,
             )
         )
         used += 1
