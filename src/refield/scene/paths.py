@@ -112,16 +112,15 @@ def smooth_path(keyframes: Sequence[Frame], count: int) -> list[tuple[Camera, Te
     fine = np.concatenate([np.linspace(a, b, _FINE, endpoint=False) for a, b in pairwise(knots)] + [knots[-1:]])
     length = np.concatenate([[0.0], np.cumsum(_travel(place(fine), turn(fine), size))])
     lenses = [_lens(k.camera, first.camera) for k in keyframes]
-    out: list[tuple[Camera, Tensor]] = []
-    for i, u in _paced(length[::_FINE], count):
-        if u == 0:
-            out.append((_camera(lenses[i], first.camera), keyframes[i].world_from_cam))
-            continue
-        start, end = length[i * _FINE], length[(i + 1) * _FINE]
-        now = np.interp(start + u * (end - start), length, fine)
-        pose = rigid(torch.from_numpy(turn(now).as_matrix()), torch.from_numpy(place(now)))
-        v = (now - knots[i]) / (knots[i + 1] - knots[i])
-        out.append((_camera((1 - v) * lenses[i] + v * lenses[i + 1], first.camera), pose))
+    parts, along = _paced(length[::_FINE], count)
+    ends = np.minimum(parts + 1, len(keyframes) - 1)
+    goal = (1 - along) * length[::_FINE][parts] + along * length[::_FINE][ends]
+    now = np.interp(goal, length, fine)
+    poses = rigid(torch.from_numpy(turn(now).as_matrix()), torch.from_numpy(place(now)))
+    out = []
+    for i, j, u, pose in zip(parts, ends, along, poses):
+        lens = _camera((1 - u) * lenses[i] + u * lenses[j], first.camera)
+        out.append((lens, pose if u else keyframes[i].world_from_cam))
     return out
 
 
@@ -145,14 +144,14 @@ def _tangents(knots: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np
     return np.concatenate([(3 * slope[:1] - inner[:1]) / 2, inner, (3 * slope[-1:] - inner[-1:]) / 2])
 
 
-def _paced(length: NDArray[np.float64], count: int) -> list[tuple[int, float]]:
-    """For each picture the part of the path it is on, and how far along that part; keyframes fall on pictures."""
-    picture = np.rint(length / length[-1] * max(count - 1, 1)).astype(int)
-    out = []
-    for n in range(count):
-        i = int(np.searchsorted(picture, n, side="right")) - 1
-        out.append((i, 0.0 if picture[i] == n else (n - picture[i]) / (picture[i + 1] - picture[i])))
-    return out
+def _paced(length: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """For each picture the part of the path it is on, (count,), and how far along that part; keyframes fall on
+    pictures."""
+    picture = np.rint(length / length[-1] * max(count - 1, 1)).astype(np.int64)
+    n = np.arange(count)
+    part = np.searchsorted(picture, n, side="right") - 1
+    span = np.append(np.diff(picture), 1)[part]
+    return part, (n - picture[part]) / span
 
 
 _LENS = tuple(f.name for f in fields(Camera))[2:]
