@@ -197,9 +197,8 @@ def test_from_visit_to_visit_begins_and_ends_with_them(place, way, blend):
         for layer in ("", "depth", "opacity"):
             for folder, name in ends:
                 assert (place / "both" / layer / name).read_bytes() == (place / folder / layer / name).read_bytes()
-    middle = (both[0] != both[-1]).float().mean() if not way else 1
-    assert middle > 0.005, "something changes"
-    if not way:
+    else:
+        assert (both[0] != both[-1]).float().mean() > 0.005, "something changes"
         ends = [picture.float() for picture in (both[0], both[-1])]
         assert torch.equal(both[0], both[1]) and torch.equal(both[-1], both[-2]), "each is seen for a moment"
         if blend == "fade":
@@ -335,12 +334,10 @@ def test_without_the_extra_an_mp4_is_refused_by_name(place):
     code = """import sys
 sys.modules["av"] = None
 from refield.cli import main
-sys.exit(main(["render", "work", "--orbit", "--frames", "2", "--out", "a." + sys.argv[1]]))"""
-    for kind, returned in (("mp4", 2), ("webp", 0)):
-        done = subprocess.run([sys.executable, "-c", code, kind], capture_output=True, text=True, env=HERE)
-        assert done.returncode == returned
-        assert ("refield[video]" in done.stderr) == (kind == "mp4")
-    assert {p.name for p in place.glob("a.*")} == {"a.webp"}
+sys.exit(main(["render", "work", "--orbit", "--frames", "2", "--out", "a.mp4"]))"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=HERE)
+    assert done.returncode == 2 and "pip install 'refield[video]', or name a .webp or .gif" in done.stderr
+    assert not list(place.glob("a.*"))
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
