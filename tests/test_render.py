@@ -21,15 +21,20 @@ from PIL import Image
 
 from refield.cli import main
 from refield.commands import update
+from refield.commands.viewpoints import free_orbit
+from refield.field.encoding import Contraction
 from refield.field.render import render_frame
 from refield.history import state
-from refield.scene.capture import centres
+from refield.scene.capture import Capture, Frame, centres
 from refield.scene.film import film
 from refield.scene.images import read_image
-from refield.scene.paths import orbit, typical_camera
+from refield.scene.paths import SPREADS, orbit, typical_camera
 from refield.scene.transforms_json import load_cameras
+from refield.scene.world import world_of
 from refield.workspace import Workspace
+from tests.captures import CAMERA, looking_at
 from tests.conftest import HERE
+from tests.fields import oracle_sampler
 from tests.folders import contents
 from tests.test_cli import FEW, believing, heeds_ctrl_c  # noqa: F401
 
@@ -166,6 +171,46 @@ def test_an_orbit_is_that_of_the_capture(place):
     own = type(frame)(frame.path, camera, frame.name, world_from_cam=pose)
     still = (render_frame(state(workspace, 1), own).rgb.clamp(0, 1) * 255).round().to(torch.uint8)
     assert any(torch.equal(picture, still) for picture in pngs("pictures"))
+
+
+class Balls:
+    """A field: solid grey balls of radius 0.3 at the given places."""
+
+    def __init__(self, *places):
+        self._places = torch.tensor(places)
+        self.sampler = oracle_sampler(self.density, Contraction(torch.zeros(3), 8.0), 0.05)
+
+    def density(self, x):
+        return 100.0 * ((x[..., None, :] - self._places).norm(dim=-1) < 0.3).any(-1)
+
+    def __call__(self, x, d):
+        return self.density(x), torch.full_like(x, 0.5)
+
+
+def photos_on_an_oval():
+    """From near on two sides of the origin, and from far on the others."""
+    turn = torch.arange(72, dtype=torch.float64) * (torch.pi / 36)
+    eyes = torch.stack([5 * turn.cos(), 1.5 * turn.sin(), 1 + 0 * turn], -1)
+    poses = [looking_at(eye, torch.zeros(3, dtype=torch.float64)) for eye in eyes]
+    return [Frame(Path(f"{i}.png"), CAMERA, f"{i}.png", world_from_cam=pose) for i, pose in enumerate(poses)]
+
+
+def test_an_orbit_leads_around_what_stands_in_its_way():
+    frames, warned = photos_on_an_oval(), []
+    world = world_of(Capture(tuple(frames)))
+
+    def around(*places):
+        return torch.stack(free_orbit(frames, world, [Balls((0.0, 0.0, 0.0)), Balls(*places)], 60, warned.append))
+
+    free = around((0.0, 0.0, 0.0))
+    assert torch.equal(free, torch.stack(orbit(frames, torch.tensor(world.up), 60, SPREADS[0]))) and not warned
+    side = free[:, 1, 3].argmax()  # where the smoothest is farther out than any photo
+    way = free[side, :3, 3]
+    assert float(way[1]) > 1.9
+    kept = around(tuple(way.tolist()))
+    assert not warned and (kept[:, :3, 3] - way).norm(dim=1).min() > 0.3
+    around(*((0.0, 0.1 * i, 1.0) for i in range(30)))  # a wall from the middle outwards, and no way around it
+    assert len(warned) == 1 and "stands in the orbit's way at" in warned[0]
 
 
 def test_a_tour_through_the_photos(place):

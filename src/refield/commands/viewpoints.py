@@ -18,6 +18,7 @@ from refield.scene.errors import InputError
 from refield.scene.left_out import Warn
 from refield.scene.paths import SPREADS, orbit, smooth_path, tour, typical_camera
 from refield.scene.transforms_json import load_cameras
+from refield.scene.world import World
 from refield.workspace import Workspace
 
 PHOTOS = Path("photos")
@@ -129,12 +130,17 @@ def views_of(
         return _one_by_one(list(capture.frames), pace)
     if around:
         count, fps = pace.of_path(_SECONDS["orbit"])
-        return Views(count, fps, lambda fields, warn: _orbit(workspace, capture, fields, count, warn))
+        camera, world = typical_camera(capture.frames), workspace.world()
+
+        def places(fields: Sequence[Field], warn: Warn) -> list[Frame]:
+            return _numbered([(camera, pose) for pose in free_orbit(capture.frames, world, fields, count, warn)])
+
+        return Views(count, fps, places)
     if path is not None:
         return _along(path, capture, pace, warn)
     count, fps = pace.of_path(_SECONDS["between"] * (len(between) - 1))
-    places = _new_photos(workspace, between) or _evenly(capture.frames)
-    return Views(count, fps, lambda fields, _: _standing(places, fields, count), standing=True)
+    candidates = _new_photos(workspace, between) or _evenly(capture.frames)
+    return Views(count, fps, lambda fields, _: _standing(candidates, fields, count), standing=True)
 
 
 def refuse_size(longest: int | None) -> None:
@@ -166,20 +172,20 @@ def _numbered(cameras: Sequence[tuple[Camera, Tensor]]) -> list[Frame]:
     return [Frame(Path(f"{i:05d}.png"), c, f"{i:05d}.png", world_from_cam=pose) for i, (c, pose) in enumerate(cameras)]
 
 
-def _orbit(workspace: Workspace, capture: Capture, fields: Sequence[Field], count: int, warn: Warn) -> list[Frame]:
-    """The smoothest that nothing stands in the way of."""
-    camera, world = typical_camera(capture.frames), workspace.world()
+def free_orbit(frames: Sequence[Frame], world: World, fields: Sequence[Field], count: int, warn: Warn) -> list[Tensor]:
+    """Of the orbits around what ``frames`` look at the smoothest that nothing stands in the way of, in any of
+    ``fields``; (4, 4) poses. If there is none, that with the fewest such places, and a warning."""
     blocked, poses = count + 1, list[Tensor]()
     for spread in SPREADS:
-        found = orbit(capture.frames, torch.tensor(world.up), count, spread)
-        steps = sum(_blocked(field, found, _CLEAR * world.size) for field in fields)
+        found = orbit(frames, torch.tensor(world.up), count, spread)
+        steps = max(_blocked(field, found, _CLEAR * world.size) for field in fields)
         if steps < blocked:
             blocked, poses = steps, found
         if blocked == 0:
             break
     if blocked:
         warn(f"something stands in the orbit's way at {blocked} of {count} places; --path photos keeps to the photos'")
-    return _numbered([(camera, pose) for pose in poses])
+    return poses
 
 
 def _blocked(field: Field, poses: Sequence[Tensor], clear: float) -> int:
