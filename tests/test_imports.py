@@ -42,7 +42,7 @@ MAY_IMPORT = {
     "__main__": None,
 }
 HEAVY = {"torch", "numpy", "scipy", "numba", "cv2", "pycolmap", "mitsuba", "PIL"}
-LATE = {"mitsuba", "drjit", "transformers"}  # extras: never when a module is loaded
+LATE = {"mitsuba", "drjit", "transformers", "av"}  # extras: never when a module is loaded
 
 
 def rooms():

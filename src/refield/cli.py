@@ -26,7 +26,7 @@ COMMANDS = {
     "visits": "what changed at each update of a workspace",
     "report": "the scene's history, all visits on one page",
     "undo": "take the last update back",
-    "render": "pictures from any camera, before or after",
+    "render": "pictures and films from anywhere, before, after and in between",
     "evaluate": "PSNR and SSIM on photos the field has never seen",
     "rehearse": "known changes put into a workspace's own photos: what an update is worth there",
     "synth": "path-trace a world that is known exactly (needs the extra 'synth')",

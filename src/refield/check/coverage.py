@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from refield.scene.capture import Capture, centres
-from refield.scene.world import World
+from refield.scene.world import World, looked_at
 
 _POINTS = 2000  # of structure from motion, that are looked at
 
@@ -37,20 +37,11 @@ def coverage_of(capture: Capture, world: World) -> Coverage:
     """How a capture's cameras stand about what they look at."""
     at = centres(capture.frames)
     forward = torch.stack([frame.world_from_cam[:3, 2] for frame in capture.frames])
-    focus = _focus(at, forward)
+    focus = looked_at(at, forward)
     up = torch.tensor(world.up, dtype=torch.float64)
     rays = torch.nn.functional.normalize(at - focus, dim=1)
     height = (rays @ up).clamp(-1, 1).asin().rad2deg()
     return Coverage(focus, _widest_gap(rays, up), float(height.min()), float(height.max()), _seen_by(capture))
-
-
-def _focus(at: Tensor, forward: Tensor) -> Tensor:
-    """The point nearest to all optical axes; what lies behind half of the cameras is no focus: then their middle."""
-    across = torch.eye(3, dtype=at.dtype) - forward[:, :, None] * forward[:, None, :]
-    normal = across.sum(0) + 1e-6 * len(at) * torch.eye(3, dtype=at.dtype)
-    focus = torch.linalg.solve(normal, (across @ at[:, :, None])[..., 0].sum(0) + 1e-6 * at.sum(0))
-    ahead = ((focus - at) * forward).sum(1) > 0
-    return focus if ahead.double().mean() > 0.5 else at.mean(0)
 
 
 def _widest_gap(rays: Tensor, up: Tensor) -> float:

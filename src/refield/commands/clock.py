@@ -128,13 +128,14 @@ class Clock:
             yield count
 
     def _lines(self, what: str) -> Callable[[int, int], None]:
-        shown = time.perf_counter()
+        began = shown = time.perf_counter()
 
         def tell(done: int, total: int) -> None:
             nonlocal shown
             if time.perf_counter() - shown > _QUIET_SECONDS:
                 shown = time.perf_counter()
-                self.console.print(f"           {what}: {done} of {total}", markup=False)
+                left = (shown - began) * (total / max(done, 1) - 1)
+                self.console.print(f"           {what}: {done} of {total}, {left:.0f} s left", markup=False)
 
         return tell
 

@@ -1,65 +1,143 @@
-"""``refield render WORK --cameras FILE --out DIR [--visit N] [--look PHOTO]``: pictures of it as it was or is."""
+"""``refield render WORK --out FILM|DIR``: pictures and films of it as it was, is, or went from the one to the other."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from refield.artefacts import writable
 from refield.commands.answer import Answer
 from refield.commands.clock import Clock
 from refield.commands.options import PLAIN, Output
-from refield.field.radiance import Field
-from refield.field.render import render_frame
+from refield.commands.outputs import (
+    KIND,
+    SCALE,
+    STEPS,
+    Places,
+    depth_scale,
+    fitting,
+    places_of,
+    write_layers,
+    write_scale,
+    written,
+)
+from refield.commands.viewpoints import Pace, Views, refuse_size, sized, views_of
+from refield.field.blend import Blend, Transition
 from refield.history import state
 from refield.scene.capture import Frame
 from refield.scene.errors import InputError, did_you_mean
 from refield.scene.exposure import Exposure
-from refield.scene.images import is_ours, write_image
-from refield.scene.left_out import named
-from refield.scene.transforms_json import load_cameras, stem
-from refield.workspace import Workspace, refuse_inside
+from refield.scene.film import is_film
+from refield.scene.transforms_json import stem
+from refield.workspace import Workspace
 
 EXAMPLES = (
-    "refield render work --cameras work/visits/001/photos/transforms.json --out pictures",
-    "refield render work --cameras before/transforms.json --out pictures --visit 0",
+    "refield render work --orbit --out around.webp",
+    "refield render work --like-photos --out pictures --visit 0",
+    "refield render work --between 0 1 --out change.gif",
 )
 
 
 @dataclass(frozen=True)
 class Render:
-    """Render the views of a transforms.json, one PNG per frame with the frame's file name."""
+    """Pictures, or a film, of a workspace from where you say: one of --orbit, --like-photos, --path and --cameras is
+    needed, or --between."""
 
     work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace"""
-    cameras: Path
-    """a transforms.json (its images need not exist), in the world of the workspace's photos"""
     out: Path
-    """the folder for the pictures"""
+    """a film, if it ends in .mp4 (needs the extra 'video'), .gif or .webp; else the folder for the pictures, as PNG"""
+    orbit: bool = False
+    """around what the photos look at, from where photographers stood; ends where it began"""
+    like_photos: bool = False
+    """as each photo of the capture was taken, one by one"""
+    path: Path | None = None
+    """a transforms.json whose views a smooth path leads through (its images need not exist), in the world of the
+    workspace's photos; or the word photos, for a tour through the photos' own places"""
+    cameras: Path | None = None
+    """a transforms.json whose views are shown one by one, in PNGs of their names"""
     visit: int | None = None
     """the state to show: 0 is before any visit; the latest by default"""
+    between: tuple[int, ...] = ()
+    """from state to state, as 0 1, or 0 1 2: on the way that is chosen, or standing where most changes"""
+    blend: Blend = "wipe"
+    """how one state goes over into the next; a fade takes longer on a way, as both are rendered"""
+    frames: int | None = None
+    """how many pictures"""
+    seconds: float | None = None
+    """how long the film is; by default 6 for an orbit, 1.5 for each part of a path, 10 for a tour, 4 for each change"""
+    fps: float | None = None
+    """pictures a second: 24 by default, 2 of views that are shown one by one"""
+    size: int | None = None
+    """the longer side in pixels; by default the photos', on a path 960 at most"""
+    depth: bool = False
+    """depths too, as 16-bit PNGs in a folder of their own, with scale.json"""
+    opacity: bool = False
+    """how much of the light each pixel holds back, too, as 8-bit PNGs in a folder of their own"""
     look: str | None = None
     """a photo of the workspace's capture whose exposure, white balance and vignetting the pictures have; by default the
     photos' mean exposure, and no vignetting"""
     overwrite: bool = False
-    """replace pictures in ``out`` that refield did not write"""
+    """replace pictures and films at ``out`` that refield did not write"""
     output: OmitArgPrefixes[Output] = PLAIN
 
 
 def run(options: Render) -> Answer:
     clock = Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     workspace = Workspace.open(options.work)
-    visit = workspace.chosen_visit(options.visit)
-    frames = load_cameras(options.cameras, warn=clock.warn)
+    visits = _visits(options, workspace)
+    refuse_size(options.size)
+    pace = Pace(options.frames, options.seconds, options.fps)
+    ways = options.cameras, options.like_photos, options.orbit, options.path
+    views = views_of(workspace, *ways, options.between, pace, clock.warn)
     exposure = None if options.look is None else exposure_of(workspace, options.look)
-    paths = output_paths(options.cameras, frames, options.out, overwrite=options.overwrite)
-    clock.stage(f"load the field as of visit {visit}")
-    render(state(workspace, visit), frames, paths, clock, exposure)
-    facts = {"workspace": options.work, "visit": visit, "pictures": paths, "seconds_per_stage": clock.seconds}
-    return Answer(facts | {"warnings": clock.warnings}, [f"{len(paths)} pictures in {options.out}"])
+    layers = {"depth": options.depth, "opacity": options.opacity}
+    places = places_of(options.out, views, options.cameras or options.work, **layers, overwrite=options.overwrite)
+    clock.stage(f"load the field as of visit {' and '.join(str(v) for v in sorted(set(visits)))}")
+    states = {visit: state(workspace, visit) for visit in sorted(set(visits))}
+    fields = [states[visit] for visit in visits]
+    frames = views.frames(fields, clock.warn)
+    even = options.out.suffix.lower() == ".mp4"
+    cameras = [sized(frame.camera, options.size, views.longest, even=even) for frame in frames]
+    if is_film(options.out):
+        cameras = fitting(cameras)
+    frames = [replace(frame, camera=camera) for frame, camera in zip(frames, cameras)]
+    show = Transition(fields, options.blend, standing=views.standing)
+    scale = depth_scale(workspace.world())
+    clock.stage(f"render {len(frames)} views")
+    beyond = 0
+    with written(options.out, places, frames, views.fps) as write, clock.counters() as counting:
+        tell = counting("pictures")
+        for i, frame in enumerate(frames):
+            shown = show(frame, i / max(len(frames) - 1, 1))
+            rgb = shown.rgb if exposure is None else exposure.taken(shown.rgb, frame.camera)
+            write(i, rgb)
+            beyond += write_layers(i, shown, places, scale)
+            tell(i + 1, len(frames))
+        if places.depths:
+            write_scale(places.depths[0].parent / SCALE, scale, workspace.world())
+    clock.stop()
+    document = {"workspace": options.work, "visits": visits, "out": options.out, "pictures": places.pictures}
+    document |= {"depths": places.depths, "depth_step": scale, "opacities": places.opacities}
+    document |= {"seconds_per_stage": clock.seconds, "warnings": clock.warnings}
+    return Answer(document, list(_told(options, views, places, frames, scale, beyond)))
+
+
+def _visits(options: Render, workspace: Workspace) -> list[int]:
+    """The states that are shown, in order."""
+    if not options.between:
+        return [workspace.chosen_visit(options.visit)]
+    if options.visit is not None:
+        raise InputError("--visit", "and --between both say which state to show", "give one of them")
+    visits = [workspace.chosen_visit(n) for n in options.between]
+    if len(visits) < 2 or any(a == b for a, b in pairwise(visits)):
+        what = f"{' '.join(map(str, visits))} is no way from one state to another"
+        raise InputError("--between", what, "name two or more states, such as 0 1")
+    return visits
 
 
 def exposure_of(workspace: Workspace, photo: str) -> Exposure:
@@ -77,49 +155,17 @@ def exposure_of(workspace: Workspace, photo: str) -> Exposure:
     raise InputError(where, f"names no photo {photo!r}", f"{near}give one of its photos, such as {frames[0].name}")
 
 
-def render(
-    field: Field, frames: list[Frame], paths: list[Path], clock: Clock, exposure: Exposure | None = None
-) -> None:
-    """Write one picture per frame, neutral or as a photo of that exposure."""
-    clock.stage(f"render {len(frames)} views")
-    with clock.counters() as counters:
-        count = counters("views")
-        for done, (frame, path) in enumerate(zip(frames, paths), 1):
-            _render(field, frame, path, exposure)
-            count(done, len(frames))
-    clock.stop()
-
-
-def _render(field: Field, frame: Frame, path: Path, exposure: Exposure | None) -> None:
-    picture = render_frame(field, frame).rgb
-    if exposure is not None:
-        picture = exposure.taken(picture, frame.camera)
-    with writable(path):
-        write_image(path, picture)
-
-
-def output_paths(cameras: Path, frames: list[Frame], out: Path, *, overwrite: bool) -> list[Path]:
-    """Where each frame's picture goes.
-
-    Raises:
-        InputError: two frames share a name, a name is none, a picture that is not ours or is one of the cameras' own
-            photos would be replaced, or they would lie in what a workspace keeps.
-    """
-    stems = [stem(frame) for frame in frames]
-    twice = sorted({s for s in stems if stems.count(s) > 1})
-    if twice:
-        what = f"several frames would be written as {named([s + '.png' for s in twice])}"
-        raise InputError(cameras, what, "give every frame its own file name")
-    unnamed = [f.name for f, s in zip(frames, stems) if s in ("", ".", "..")]
-    if unnamed:
-        raise InputError(cameras, f"the frame {unnamed[0]!r} has no file name", "name its image")
-    if out.exists() and not out.is_dir():
-        raise InputError(out, "is a file, not a folder", "choose another output folder")
-    paths = [out / f"{s}.png" for s in stems]
-    refuse_inside(out, *paths)
-    photos = {frame.path.resolve() for frame in frames}  # refield may have written them too: those of a made-up world
-    foreign = [p.name for p in paths if p.exists() and (not is_ours(p) or p.resolve() in photos)]
-    if foreign and not overwrite:
-        what = f"holds pictures that refield render did not write ({named(foreign)})"
-        raise InputError(out, what, "choose another output folder, or pass --overwrite")
-    return paths
+def _told(
+    options: Render, views: Views, places: Places, frames: Sequence[Frame], scale: float, beyond: int
+) -> Iterator[str]:
+    if is_film(options.out):
+        camera = frames[0].camera
+        seconds = len(frames) / views.fps
+        yield f"{len(frames)} pictures of {camera.width}x{camera.height}, {seconds:.3g} s, in {options.out}"
+    else:
+        yield f"{len(frames)} pictures in {options.out}"
+    if places.depths:
+        far = f"; {beyond} pixels lie farther off than {scale * STEPS:.3g} and hold {STEPS}" if beyond else ""
+        yield f"depths in {places.depths[0].parent}: {KIND} in steps of {scale:g} units, 0 where nothing is{far}"
+    if places.opacities:
+        yield f"opacities in {places.opacities[0].parent}"

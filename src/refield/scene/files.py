@@ -120,7 +120,7 @@ def write_bytes(path: Path, data: bytes, *, durable: bool = True) -> None:
             file.flush()
             if durable:
                 os.fsync(file.fileno())
-        temporary.chmod(0o666 & ~_umask())
+        temporary.chmod(0o666 & ~umask())
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -132,7 +132,8 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
     write_bytes(path, (json.dumps(data, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
-def _umask() -> int:
+def umask() -> int:
+    """The process's, for files that were made as temporary ones."""
     mask = os.umask(0)  # there is no way to read it without setting it
     os.umask(mask)
     return mask

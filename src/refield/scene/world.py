@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from refield.scene.capture import Capture, centres
 from refield.scene.errors import InputError
@@ -64,3 +65,13 @@ def world_of(capture: Capture, metres_per_unit: float | None = None) -> World:
     at = centres(capture.frames)
     x, y, z = (float(v) for v in up)
     return World((x, y, z), float(torch.cdist(at, at).max()), metres_per_unit)
+
+
+def looked_at(at: Tensor, forward: Tensor) -> Tensor:
+    """What cameras with centres (F, 3) and unit optical axes (F, 3) look at, (3,): the point nearest to all axes. What
+    lies behind half of the cameras is not looked at: then their middle."""
+    across = torch.eye(3, dtype=at.dtype) - forward[:, :, None] * forward[:, None, :]
+    normal = across.sum(0) + 1e-6 * len(at) * torch.eye(3, dtype=at.dtype)
+    focus = torch.linalg.solve(normal, (across @ at[:, :, None])[..., 0].sum(0) + 1e-6 * at.sum(0))
+    ahead = ((focus - at) * forward).sum(1) > 0
+    return focus if ahead.double().mean() > 0.5 else at.mean(0)
