@@ -24,13 +24,21 @@ MAY_IMPORT = {
     "rehearse": {"scene", "field", "synthetic"},
     "check": {"scene", "field", "vision", "photos"},
     "history": {"scene", "field", "update", "workspace", "artefacts"},
+    "export": {"scene", "field", "artefacts", "workspace", "history"},
     "cli": {"scene", "commands"},
     "commands": None,  # joins everything
     "__init__": None,
     "__main__": None,
 }
 HEAVY = {"torch", "numpy", "scipy", "numba", "cv2", "pycolmap", "mitsuba", "PIL"}
-LATE = {"mitsuba", "drjit", "transformers"}  # extras: never when a module is loaded
+LATE = {
+    "mitsuba",
+    "drjit",
+    "transformers",
+    "gsply",
+    "skimage",
+    "fast_simplification",
+}  # extras: never when a module is loaded
 
 
 def rooms():

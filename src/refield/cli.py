@@ -23,6 +23,7 @@ COMMANDS = {
     "visits": "what changed at each update of a workspace",
     "undo": "take the last update back",
     "render": "pictures from any camera, before or after",
+    "export": "points, mesh, splats, cameras and changes for other programs",
     "evaluate": "PSNR and SSIM on photos the field has never seen",
     "rehearse": "known changes put into a workspace's own photos: what an update is worth there",
     "synth": "path-trace a world that is known exactly (needs the extra 'synth')",

@@ -1,7 +1,7 @@
 """glTF 2.0 in one binary file (.glb): meshes with colours, cameras, and nodes that hold poses.
 
 glTF's y points up. All nodes hang on one, ``upright_from_world``, that turns the world by the smallest rotation that
-brings its up there, and does nothing else: below it every position and pose is in the world's own coordinates and units.
+brings its up there, and does nothing else: below it everything is in the world's own coordinates and units.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Glb:
         self._world = world
         self._data = bytearray()
         self._parts: dict[str, list[dict[str, Any]]] = {}
-        root = {"name": ROOT, "rotation": quaternion(upright(world)[:3, :3]), "children": []}
+        root: dict[str, Any] = {"name": ROOT, "rotation": quaternion(upright(world)[:3, :3]), "children": []}
         self._add("nodes", root)
         self._root = root
         facts = {"up": list(world.up), "metres_per_unit": world.metres_per_unit, **extras}
@@ -71,7 +71,9 @@ class Glb:
         quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
         faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], "<u4")
         position = self._array(corner.numpy().astype("<f4"), _FLOAT, _VERTICES, bounds=True)
-        return self._mesh({"POSITION": position}, self._array(faces.reshape(-1), _UINT32, _INDICES), self._unlit(colour))
+        return self._mesh(
+            {"POSITION": position}, self._array(faces.reshape(-1), _UINT32, _INDICES), self._unlit(colour)
+        )
 
     def add_camera(self, camera: Camera) -> int:
         """A camera's field of view; its number. glTF knows neither distortion nor an optical axis beside the middle."""

@@ -1,7 +1,7 @@
 """A triangle mesh through the points of a surface: marching cubes where a smooth field of signed distances is nought.
 
-The distance at a place is the mean of those to the tangent planes of the points around it; it is asked only near points,
-so that what nobody has seen stays open.
+The distance at a place is the mean of those to the tangent planes of the points around it; it is asked only near
+points, so that what nobody has seen stays open.
 """
 
 from __future__ import annotations
@@ -111,7 +111,9 @@ def _distances(
     return distance, binary_erosion(sure, cube)
 
 
-def _without_crumbs(xyz: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _without_crumbs(
+    xyz: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Without what hangs together and is small, and without vertices that no face has."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -135,7 +137,11 @@ def _decimated(
 
 
 def _coloured(
-    points: Points, xyz: NDArray[np.float64], faces: NDArray[np.int64], far: NDArray[np.float64], near: NDArray[np.int64]
+    points: Points,
+    xyz: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    far: NDArray[np.float64],
+    near: NDArray[np.int64],
 ) -> Mesh:
     """With the colours of the four points nearest to each vertex, the nearest most, and normals of its faces."""
     weight = torch.from_numpy(1 / (far + 1e-3 * far.mean() + 1e-12)).float()[..., None]

@@ -1,7 +1,7 @@
 """The surfaces that a field shows, as points: where its photos' rays end, kept where the views agree.
 
-Letters: V views of h x w pixels, P points. A point's *footprint* is how far apart, in world units, neighbouring pixels of
-a view lie at its distance: what can be told apart there. Everything is in the world of the field.
+Letters: V views of h x w pixels, P points. A point's *footprint* is how far apart, in world units, neighbouring pixels
+of a view lie at its distance: what can be told apart there. Everything is in the world of the field.
 """
 
 from __future__ import annotations
@@ -129,7 +129,9 @@ class _Seen:
         return (2 * (1 - self.facing.norm(dim=-1))).clamp_min(0).sqrt()
 
 
-def views_of(field: Field, frames: Sequence[Frame], on_progress: Progress | None = None, rays: int = RAYS) -> list[View]:
+def views_of(
+    field: Field, frames: Sequence[Frame], on_progress: Progress | None = None, rays: int = RAYS
+) -> list[View]:
     """What ``field`` shows where its photos were taken, with about so many rays at most in all."""
     out = []
     for i, frame in enumerate(frames):
@@ -190,9 +192,9 @@ def _beyond(xyz: Tensor, loose: Tensor, points: Points, views: Sequence[View]) -
 def _asked_again(field: Field, views: Sequence[View], points: Points, tolerance: float) -> Points:
     """The points as the field shows them from close by, on the way on which they are seen most squarely.
 
-    Depths of slanted surfaces are pooled from few and long pixels: this one is better, and its colour is not blurred, as
-    far as it is near what the views show there in the mean. What is not met near where it was is left out, and so is what
-    the views do not agree on any longer.
+    Depths of slanted surfaces are pooled from few and long pixels: this one is better. Its colour is not blurred, as
+    far as it is near what the views show there in the mean. What is not met near where it was is left out, and so is
+    what the views do not agree on any longer.
     """
     way = _squarest(views, points, tolerance)
     back = _BACK * points.footprint
@@ -219,8 +221,8 @@ def _squarest(views: Sequence[View], points: Points, tolerance: float) -> Tensor
 
 
 def _asked(view: View, xyz: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Which of the points (P, 3) a view shows: their numbers, pixels (K, 2) and distances (K,); and the numbers of those
-    that it looks through."""
+    """Which of the points (P, 3) a view shows: their numbers, pixels (K, 2) and distances (K,); and the numbers of
+    those that it looks through."""
     local = transform(invert(view.world_from_cam), xyz)
     pixels, z = view.camera.project(local)
     size = pixels.new_tensor([view.camera.width, view.camera.height])
@@ -268,7 +270,7 @@ def _picked(picture: Tensor, pixels: Tensor) -> Tensor:
 
 
 def _thinned(xyz: Tensor, rgb: Tensor, footprint: Tensor, facing: Tensor, most: int) -> Points:
-    """Points of which several stand in one footprint pooled into one, or in more, until they are no more than ``most``."""
+    """One point in place of all that stand in one footprint, or in more, until they are no more than ``most``."""
     wide = 1.0
     while True:
         cells = cells_of(xyz, footprint * wide)
@@ -319,7 +321,7 @@ def mean_over(values: Tensor, cells: Tensor) -> Tensor:
 
 
 def _tolerance(views: Sequence[View]) -> float:
-    """How far depths of neighbouring views may disagree, as a part of the depth: three deviations, one pixel at least."""
+    """How far depths of neighbouring views may disagree, as a part of them: three deviations, a pixel at least."""
     at = torch.stack([view.centre for view in views])
     apart = torch.cdist(at, at).fill_diagonal_(torch.inf)
     found = []
