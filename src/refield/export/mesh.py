@@ -25,7 +25,8 @@ from refield.scene.world import World
 FACES = 200_000
 """of a mesh, at most: more are decimated"""
 _CELLS = 40_000_000  # of the lattice, at most
-_CELL = 1.0  # of the points' median spacing
+_NEAR, _WIDER = 0.05, 4.0  # of the points at least are what the photos are of; they are no farther apart than so many
+# times as they are in its densest parts, and half of those are closer than a cell
 _COARSE = 3.0  # cells: points that are farther apart are left out
 _REACH = 3.0  # cells, or spacings if these are more, from the nearest point: there a distance is believed
 _AMONG = 8  # points whose planes are averaged
@@ -62,8 +63,8 @@ def mesh_of(points: Points, most: int = FACES) -> Mesh | None:
     distance, sure = _distances(points, tree, low, cell, shape)
     if not (sure.any() and distance[sure].min() < 0 < distance[sure].max()):
         return None
-    # gradient "ascent": distances grow towards the outside
-    xyz, faces, _, _ = marching_cubes(distance, 0.0, mask=sure, gradient_direction="ascent", allow_degenerate=False)
+    # "descent" turns faces towards the larger values: the outside
+    xyz, faces, _, _ = marching_cubes(distance, 0.0, mask=sure, gradient_direction="descent", allow_degenerate=False)
     xyz, faces = _without_crumbs(xyz * cell + low.numpy(), faces.astype(np.int64))
     if len(faces) > most:
         xyz, faces = _decimated(xyz, faces, most)
@@ -73,9 +74,10 @@ def mesh_of(points: Points, most: int = FACES) -> Mesh | None:
 
 def _lattice(points: Points) -> tuple[Tensor, float, tuple[int, ...]]:
     """The first node (3,), the distance between nodes and how many there are along each axis."""
-    sample = points.xyz[:: max(len(points) // 100_000, 1)]
-    low, high = sample.quantile(_INSIDE, 0), sample.quantile(1 - _INSIDE, 0)
-    cell = _CELL * float(points.spacing.median())
+    close = points.spacing < _WIDER * float(np.quantile(points.spacing.numpy(), _NEAR))
+    cell = float(points.spacing[close].median())
+    within = points.xyz[points.spacing < _COARSE * cell].numpy()
+    low, high = (torch.from_numpy(np.quantile(within, q, 0)).float() for q in (_INSIDE, 1 - _INSIDE))
     low, high = low - 4 * cell, high + 4 * cell
     cell = max(cell, (float((high - low).prod()) / _CELLS) ** (1 / 3))
     return low, cell, tuple(int(n) for n in ((high - low) / cell).ceil().long() + 1)

@@ -33,7 +33,8 @@ _PIECE = 200_000  # points that are looked at at once
 _FINE = 1.0  # footprints: cells in which pixels are pooled before the views are asked about them
 _AGREE = 2  # views, its own among them, have to show a point
 _THROUGH = 0.25  # of as many views as show a point may look through it
-_PARALLAX = 0.25  # of the parallax that surfaces have in the median; where it is less their distance is not known
+_PARALLAX = 0.2  # of that of the nearer surfaces; where it is less their distance is not known
+_NEARER = 0.75  # of the pixels may show a sky
 _BACK, _STRAY = 4.0, 3.0  # footprints: from how far a point is asked for again, and how far it may have been off
 _CLOSE = 0.06  # of a colour's range: a colour from close by may differ by as much from the views' mean
 _NEIGHBOURS = 12  # tell a normal
@@ -165,7 +166,8 @@ def surface_of(field: Field, views: Sequence[View], most: int = POINTS) -> Surfa
     parallax = seen.parallax
     firm = seen.agreed
     if firm.any():
-        firm &= parallax > _PARALLAX * parallax[cells][firm[cells]].median()
+        usual = np.quantile(parallax[cells][firm[cells]].numpy(), _NEARER)
+        firm &= parallax > _PARALLAX * float(usual)
     points = _thinned(pooled[firm], seen.rgb[firm], seen.footprint[firm], seen.facing[firm], most)
     far = _beyond(xyz, ~firm[cells], points, views)
     if len(points):
