@@ -24,8 +24,10 @@ def draw(splats, camera, cam_from_world):
     half = view @ turn * scales[:, None, :]
     slope = np.zeros((len(means), 2, 3))
     safe = np.where(depth > 0.05, depth, 1.0)
-    slope[:, 0, 0], slope[:, 0, 2] = camera.fx / safe, -camera.fx * local[:, 0] / safe**2
-    slope[:, 1, 1], slope[:, 1, 2] = camera.fy / safe, -camera.fy * local[:, 1] / safe**2
+    # as the method's own code has it: what lies far beside the picture is projected as if it were at 1.3 of its border
+    for row, focal, size in ((0, camera.fx, camera.width), (1, camera.fy, camera.height)):
+        aside = np.clip(local[:, row] / safe, -0.65 * size / focal, 0.65 * size / focal)
+        slope[:, row, row], slope[:, row, 2] = focal / safe, -focal * aside / safe
     flat = slope @ half
     spread = flat @ flat.transpose(0, 2, 1) + 0.3 * np.eye(2)
     at = np.stack([camera.fx * local[:, 0] / safe + camera.cx, camera.fy * local[:, 1] / safe + camera.cy], -1)

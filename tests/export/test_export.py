@@ -101,7 +101,8 @@ def test_the_mesh_follows_the_surfaces(made):
     assert distance(points).abs().mean() < 0.01
     assert torch.cdist(on_tops(BOX), points).amin(1).mean() < 0.04
     middles, normals = torch.tensor(read.triangles_center), torch.tensor(read.face_normals)
-    assert ((normals * outward(middles)).sum(-1) > 0.7).float().mean() > 0.9
+    right = (normals * outward(middles)).sum(-1) > 0.7
+    assert torch.tensor(read.area_faces)[right].sum() / read.area > 0.85  # all but the rims of what is open
     # the same in glTF: below the node that turns it upright its numbers are the world's
     scene = trimesh.load(made / "out/mesh.glb", process=False)
     (shape,) = scene.geometry.values()
