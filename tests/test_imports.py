@@ -36,13 +36,22 @@ MAY_IMPORT = {
         "workspace",
         "history",
     },
+    "export": {"scene", "field", "artefacts", "workspace", "history"},
     "cli": {"scene", "commands"},
     "commands": None,  # joins everything
     "__init__": None,
     "__main__": None,
 }
 HEAVY = {"torch", "numpy", "scipy", "numba", "cv2", "pycolmap", "mitsuba", "PIL"}
-LATE = {"mitsuba", "drjit", "transformers", "av"}  # extras: never when a module is loaded
+LATE = {  # extras: never when a module is loaded
+    "mitsuba",
+    "drjit",
+    "transformers",
+    "av",
+    "gsply",
+    "skimage",
+    "fast_simplification",
+}
 
 
 def rooms():

@@ -27,6 +27,7 @@ COMMANDS = {
     "report": "the scene's history, all visits on one page",
     "undo": "take the last update back",
     "render": "pictures and films from anywhere, before, after and in between",
+    "export": "points, mesh, splats, cameras and changes for other programs",
     "evaluate": "PSNR and SSIM on photos the field has never seen",
     "rehearse": "known changes put into a workspace's own photos: what an update is worth there",
     "synth": "path-trace a world that is known exactly (needs the extra 'synth')",

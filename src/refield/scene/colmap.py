@@ -62,14 +62,8 @@ def load_colmap(folder: Path, *, images_folder: Path | None = None, warn: Warn =
 
 
 def save_colmap(folder: Path, capture: Capture, *, text: bool = False) -> None:
-    """Write a capture's cameras, poses and points as a COLMAP model into ``folder`` (images are not copied).
-
-    Raises:
-        ValueError: a camera has k3, which COLMAP's OPENCV model lacks.
-    """
+    """Write a capture's cameras, poses and points as a COLMAP model into ``folder`` (images are not copied)."""
     pycolmap = quiet_pycolmap()
-    if any(frame.camera.k3 for frame in capture.frames):
-        raise ValueError("COLMAP's OPENCV camera has no k3")
     model = pycolmap.Reconstruction()
     known: dict[Camera, int] = {}
     for index, frame in enumerate(capture.frames, start=1):

@@ -1,11 +1,13 @@
-"""Point clouds in the PLY format: only what SfM tools write (vertex x y z, ASCII or little-endian)."""
+"""Point clouds and meshes in the PLY format. Read: only what SfM tools write (vertex x y z, ASCII or little-endian)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.scene.errors import InputError
@@ -21,10 +23,44 @@ _TYPES = {
 
 def write_points(path: Path, points: Tensor) -> None:
     """Write (P, 3) points as a little-endian PLY, at once."""
-    data = points.detach().cpu().numpy().astype("<f4")
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(data)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-    write_bytes(path, header.encode() + data.tobytes())
+    write_surface(path, points)
+
+
+def write_surface(
+    path: Path,
+    points: Tensor,
+    *,
+    normals: Tensor | None = None,
+    rgb: Tensor | None = None,
+    faces: Tensor | None = None,
+    comments: Sequence[str] = (),
+) -> None:
+    """Write (P, 3) points, if given with their normals (P, 3), colours (P, 3) in [0, 1] and triangles (F, 3), as a
+    little-endian PLY, at once. ``comments``: ASCII lines for its header."""
+    kinds = [(axis, "<f4", "float") for axis in "xyz"]
+    columns = list(_rows(points).T)
+    if normals is not None:
+        kinds += [(f"n{axis}", "<f4", "float") for axis in "xyz"]
+        columns += list(_rows(normals).T)
+    if rgb is not None:
+        kinds += [(name, "u1", "uchar") for name in ("red", "green", "blue")]
+        columns += list(np.rint(_rows(rgb).clip(0, 1) * 255).T)
+    vertices = np.zeros(len(points), [(name, dtype) for name, dtype, _ in kinds])
+    for (name, _, _), column in zip(kinds, columns):
+        vertices[name] = column
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    lines += [f"element vertex {len(vertices)}", *(f"property {word} {name}" for name, _, word in kinds)]
+    data = vertices.tobytes()
+    if faces is not None:
+        triangles = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+        triangles["count"], triangles["corners"] = 3, faces.cpu().numpy()
+        lines += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
+        data += triangles.tobytes()
+    write_bytes(path, "\n".join([*lines, "end_header\n"]).encode("ascii") + data)
+
+
+def _rows(values: Tensor) -> NDArray[np.float32]:
+    return values.detach().cpu().numpy().astype("<f4")
 
 
 def read_points(path: Path) -> Tensor:

@@ -93,11 +93,16 @@ def save_transforms(path: Path, capture: Capture) -> None:
         {
             "file_path": frame.path.resolve().relative_to(root).as_posix(),
             **({} if one_camera else write_camera(frame.camera)),
-            "transform_matrix": (frame.world_from_cam.double().cpu() @ _FLIP).tolist(),
+            "transform_matrix": opengl_pose(frame.world_from_cam).tolist(),
         }
         for frame in capture.frames
     ]
     write_json(json_path, out)
+
+
+def opengl_pose(world_from_cam: Tensor) -> Tensor:
+    """A pose (4, 4) of OpenCV camera axes as one of OpenGL's, which Blender and glTF have too; float64."""
+    return world_from_cam.double().cpu() @ _FLIP
 
 
 def stem(frame: Frame) -> str:
