@@ -23,6 +23,7 @@ MAY_IMPORT = {
     "baselines": {"scene", "field", "vision", "update"},  # learns from what the update's supervision leaves
     "rehearse": {"scene", "field", "synthetic"},
     "check": {"scene", "field", "vision", "photos"},
+    "nerfstudio": {"scene", "field"},
     "history": {"scene", "field", "update", "workspace", "artefacts"},
     "cli": {"scene", "commands"},
     "commands": None,  # joins everything
@@ -30,7 +31,7 @@ MAY_IMPORT = {
     "__main__": None,
 }
 HEAVY = {"torch", "numpy", "scipy", "numba", "cv2", "pycolmap", "mitsuba", "PIL"}
-LATE = {"mitsuba", "drjit", "transformers"}  # extras: never when a module is loaded
+LATE = {"mitsuba", "drjit", "transformers", "yaml"}  # extras: never when a module is loaded
 
 
 def rooms():
