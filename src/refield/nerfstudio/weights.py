@@ -23,14 +23,15 @@ from refield.field.nerfstudio import (
 )
 from refield.nerfstudio.placing import Placing
 from refield.nerfstudio.tables import GridSettings, features_in, laid_out, torch_levels
+from refield.nerfstudio.tiny_cuda import Layers, grid_levels, grid_size, network_layers
 from refield.scene.errors import InputError
 
 State = Mapping[str, Tensor]
-Layers = list[tuple[Tensor, Tensor]]
-"""weights (out, in) and biases (out,)"""
-_FLIPPED = (1, 3, 5, 7, 9, 11, 13, 15)  # spherical harmonics that have the other sign there
+_FLIPPED = (1, 3, 5, 7, 9, 11, 13, 15)  # spherical harmonics of the other sign in nerfstudio's torch code
 _HARMONICS = 16
-_PACKED = "params"  # how tiny-cuda-nn's weights are named
+_GEOMETRY = 15  # features that the trunk hands on; no setting
+_PACKED = "tcnn_encoding.params"  # how tiny-cuda-nn's weights are named
+_PACKED_HEAD = f"field.mlp_head.{_PACKED}"
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,8 @@ def field_of(
         white: a white background is shown; else it is black, as what is transparent in our photos.
 
     Raises:
-        InputError: the tensors are not what the settings say, or are packed for tiny-cuda-nn.
+        InputError: the tensors are not what the settings say, in nerfstudio's or tiny-cuda-nn's layout.
     """
-    if any(name.endswith(_PACKED) for name in state):
-        what = "holds the packed weights of tiny-cuda-nn, which are not read"
-        raise InputError(where, what, "train again with --pipeline.model.implementation torch")
     try:
         return _field(state, model, placing, white)
     except (KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
@@ -91,6 +89,7 @@ def _field(state: State, model: Mapping[str, Any], placing: Placing, white: bool
         even=model.get("proposal_initial_sampler", "piecewise") == "uniform",
         first_density=float(model.get("average_init_density", 1.0)),
         box=box,
+        halved=_PACKED_HEAD not in state,
         sky=_sky(model.get("background_color", "last_sample"), white),
     )
     field = NerfstudioField(config, looking_everywhere(placing.centre.float(), config))
@@ -112,7 +111,8 @@ def _trunk(state: State, model: Mapping[str, Any]) -> Network:
         model["log2_hashmap_size"],
         model.get("features_per_level", 2),
     )
-    return _network(state, ("field.mlp_base.model.", "field.mlp_base."), settings)
+    widths = (model["hidden_dim"], 1 + _GEOMETRY)
+    return _network(state, ("field.mlp_base.model.", "field.mlp_base."), settings, widths)
 
 
 def _proposals(state: State, model: Mapping[str, Any]) -> list[Network]:
@@ -131,20 +131,39 @@ def _proposals(state: State, model: Mapping[str, Any]) -> list[Network]:
         name = f"proposal_networks.{which}."
         if said.get("use_linear", False):
             layers = [(state[f"{name}linear.weight"].float(), state[f"{name}linear.bias"].float())]
-            out.append(_behind_grid(state[f"{name}encoding.hash_table"], layers, settings))
+            out.append(_behind_grid(state, f"{name}encoding.", layers, settings))
         else:
-            out.append(_network(state, (f"{name}mlp_base.",), settings))
+            widths = (*[said.get("hidden_dim", 64)] * (said.get("num_layers", 2) - 1), 1)
+            out.append(_network(state, (f"{name}mlp_base.",), settings, widths))
     return out
 
 
-def _network(state: State, prefixes: tuple[str, ...], settings: GridSettings) -> Network:
-    """The hash grid and the layers under the first of the prefixes that is there; it changed with nerfstudio 1.0."""
-    prefix = next((p for p in prefixes if f"{p}0.hash_table" in state), prefixes[0])
-    return _behind_grid(state[f"{prefix}0.hash_table"], _layers(state, f"{prefix}1."), settings)
+def _network(state: State, prefixes: tuple[str, ...], settings: GridSettings, widths: tuple[int, ...]) -> Network:
+    """The hash grid and the layers, of these ``widths``, under the first of the prefixes that is there; it changed with
+    nerfstudio 1.0."""
+    inputs = settings.num_levels * settings.features_per_level
+    for prefix in prefixes:
+        if f"{prefix}params" in state:  # both in one, the network first
+            packed, size = state[f"{prefix}params"], grid_size(settings)
+            layers = network_layers(packed[: max(len(packed) - size, 0)], (inputs, *widths), ones=False)
+            return _laid_out(packed[len(packed) - size :], layers, settings)
+        if f"{prefix}1.{_PACKED}" in state:
+            layers = network_layers(state[f"{prefix}1.{_PACKED}"], (inputs, *widths), ones=True)
+            return _behind_grid(state, f"{prefix}0.", layers, settings)
+        if f"{prefix}1.layers.0.weight" in state:
+            return _behind_grid(state, f"{prefix}0.", _layers(state, f"{prefix}1."), settings)
+    raise KeyError(f"{prefixes[0]}…")
 
 
-def _behind_grid(table: Tensor, layers: Layers, settings: GridSettings) -> Network:
-    tables, grid = laid_out(torch_levels(table, settings), settings.log2_hashmap_size)
+def _behind_grid(state: State, prefix: str, layers: Layers, settings: GridSettings) -> Network:
+    packed = state.get(f"{prefix}{_PACKED}")
+    return _laid_out(state[f"{prefix}hash_table"] if packed is None else packed, layers, settings)
+
+
+def _laid_out(table: Tensor, layers: Layers, settings: GridSettings) -> Network:
+    """``table`` is (entries, features), or flat where tiny-cuda-nn has packed it."""
+    levels, scales = grid_levels(table, settings) if table.ndim == 1 else (torch_levels(table, settings), ())
+    tables, grid = laid_out(levels, settings.log2_hashmap_size, scales)
     (weight, bias), *rest = layers
     return Network(tables, [(features_in(weight, settings), bias), *rest], grid)
 
@@ -160,15 +179,18 @@ def _layers(state: State, prefix: str) -> Layers:
 
 def _colour(state: State, model: Mapping[str, Any], features: int) -> Layers:
     """Behind 16 harmonics in our signs and the features; the mean embedding has become a bias."""
-    (weight, bias), *rest = _layers(state, "field.mlp_head.")
-    signs = torch.ones(_HARMONICS)
-    signs[list(_FLIPPED)] = -1
-    known = _HARMONICS + features
-    table = state.get("field.embedding_appearance.embedding.weight")
+    table, known = state.get("field.embedding_appearance.embedding.weight"), _HARMONICS + features
+    inputs, signs = known + (0 if table is None else table.shape[1]), torch.ones(_HARMONICS)
+    if _PACKED_HEAD in state:
+        width = model.get("hidden_dim_color", 64)
+        (weight, bias), *rest = network_layers(state[_PACKED_HEAD], (inputs, width, width, 3), ones=True)
+    else:
+        (weight, bias), *rest = _layers(state, "field.mlp_head.")
+        signs[list(_FLIPPED)] = -1
+    if weight.shape[1] != inputs:
+        raise ValueError(f"the colour network takes {weight.shape[1]} numbers, not {inputs}")
     if table is not None and model.get("use_average_appearance_embedding", True):
         bias = bias + weight[:, known:] @ table.float().mean(0)
-    elif table is None and weight.shape[1] != known:
-        raise ValueError(f"the colour network takes {weight.shape[1]} numbers, not {known}")
     return [(torch.cat([weight[:, :_HARMONICS] * signs, weight[:, _HARMONICS:known]], 1), bias), *rest]
 
 
