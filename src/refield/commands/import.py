@@ -19,6 +19,7 @@ from refield.nerfstudio.placing import placing_of, trained_on, with_poses
 from refield.nerfstudio.run import TAG, Run, read_run
 from refield.nerfstudio.weights import field_of
 from refield.scene.capture import Capture, Frame, Rays, camera_rays
+from refield.scene.errors import InputError
 from refield.scene.images import frame_image, opened
 from refield.scene.refined import in_words
 from refield.scene.transforms_json import load_transforms
@@ -42,6 +43,8 @@ class Import:
     """the folder with the transforms.json that the run was trained on, or that file; by default as config.yml says"""
     step: int | None = None
     """the checkpoint's; the last one by default"""
+    occupancy: int = 128
+    """cells a side of the grid of where something may be, by which an update marches; fewer are found sooner"""
     overwrite: bool = False
     """replace the workspace that is there, with its visits"""
     scale: float | None = None
@@ -51,6 +54,8 @@ class Import:
 def run(options: Import) -> None:
     clock = Clock()
     check_scale(options.scale)
+    if not 4 <= options.occupancy <= 512:
+        raise InputError("--occupancy", f"{options.occupancy} cells a side is no grid", "give 4 to 512, 128 is usual")
     Workspace.refuse_unless_free(options.work, overwrite=options.overwrite)
     clock.stage("read the run")
     source = read_run(options.run)
@@ -68,7 +73,7 @@ def run(options: Import) -> None:
     elif adjustment is not None:
         clock.warn("which photo each refined pose belongs to cannot be told; the poses stay as they were given")
     clock.stage("look where something is")
-    field.looking_around()
+    field.looking_around(options.occupancy)
     psnr = _measured(field, found, split, clock)
     with Workspace.building(options.work, overwrite=options.overwrite, made_by="import") as workspace:
         clock.stage("keep the photos and the field")

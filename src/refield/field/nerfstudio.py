@@ -196,7 +196,7 @@ class NerfstudioField(nn.Module):
         for density, following in zip(densities, self.config.counts[1:], strict=True):
             samples = self.span.samples(edges)
             w = weights(density(samples.positions(rays)[0]), samples)
-            edges = resampled(Histogram(edges, w.reshape(len(rays), -1)), following + 1, jitter)[:, :-1]
+            edges = resampled(Histogram(edges, w.reshape(len(rays), edges.shape[1] - 1)), following + 1, jitter)[:, :-1]
         return edges
 
     def _with_sky(self, found: Samples) -> Samples:
