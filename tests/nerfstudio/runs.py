@@ -23,7 +23,8 @@ from tests.captures import write_capture
 PHOTOS, RADIUS = 13, 2.5
 APPLIED = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 LEVELS, BASE, FINEST, TABLE, WIDTH, EMBEDDING = 4, 4, 50, 9, 16, 6
-PROPOSALS = ((3, 4, 16, 8), (3, 4, 24, 8))  # levels, coarsest, finest, log2 of the table
+PROPOSALS = ((3, 4, 16, 9), (3, 4, 24, 8))  # levels, coarsest, finest, log2 of the table
+"""tiny-cuda-nn's second level of the first just fits its table: 8 vertices a side, 512 rows"""
 COUNTS = (24, 12, 10)
 
 CONFIG = """\
@@ -74,7 +75,7 @@ pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConf
     - 12
     proposal_initial_sampler: piecewise
     proposal_net_args_list:
-    - {{base_res: 4, hidden_dim: 16, log2_hashmap_size: 8, max_res: 16, num_levels: 3, use_linear: false}}
+    - {{base_res: 4, hidden_dim: 16, log2_hashmap_size: 9, max_res: 16, num_levels: 3, use_linear: false}}
     - {{base_res: 4, hidden_dim: 16, log2_hashmap_size: 8, max_res: 24, num_levels: 3, use_linear: true}}
     use_average_appearance_embedding: true
 relative_model_dir: !!python/object/apply:pathlib.PosixPath
@@ -169,7 +170,7 @@ def torch_state(*, legacy: bool = False) -> dict[str, Tensor]:
     state[f"field.mlp_base.{mlp}.layers.1.bias"][0] += 0.5  # so that something is to be seen, but not everywhere
     for i, columns in enumerate((31 + EMBEDDING, WIDTH, WIDTH)):
         linear(f"field.mlp_head.layers.{i}", 3 if i == 2 else WIDTH, columns)
-    table("proposal_networks.0.mlp_base.0", 3, 8)
+    table("proposal_networks.0.mlp_base.0", 3, 9)
     linear("proposal_networks.0.mlp_base.1.layers.0", WIDTH, 6)
     linear("proposal_networks.0.mlp_base.1.layers.1", 1, WIDTH)
     table("proposal_networks.1.encoding", 3, 8)
@@ -284,7 +285,7 @@ class Theirs:
         growth = np.exp((np.log(finest) - np.log(base)) / (levels - 1))
         for i, cells in enumerate(torch.floor(base * growth ** torch.arange(levels)).tolist()):  # in single precision
             rows = table[i << log2 : (i + 1) << log2]
-            out.append(_trilinear(unit * cells, lambda c, rows=rows: rows[hashed(c, len(rows))]))
+            out.append(trilinear(unit * cells, lambda c, rows=rows: rows[hashed(c, len(rows))]))
         return np.concatenate(out)
 
     def _mlp(self, name: str, x: np.ndarray) -> np.ndarray:
@@ -317,18 +318,15 @@ def _staggered(packed: np.ndarray, unit: np.ndarray, levels: int, base: int, fin
             fits = side**3 <= len(rows)
             return rows[(c[0] + c[1] * side + c[2] * side**2) % len(rows) if fits else hashed(c, len(rows))]
 
-        out.append(_trilinear(unit * scale + 0.5, row))
+        out.append(trilinear(unit * scale + 0.5, row))
         at += size
     return np.concatenate(out)
 
 
-def _trilinear(p: np.ndarray, row) -> np.ndarray:
+def trilinear(p: np.ndarray, row) -> np.ndarray:
     low = np.floor(p).astype(int)
-    f, total = p - low, np.zeros(2)
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.prod(np.where(corner, f, 1 - f))
-        total += weight * row(tuple(int(v) for v in low + corner))
-    return total
+    f, corners = p - low, list(np.ndindex(2, 2, 2))
+    return sum(np.prod(np.where(c, f, 1 - f)) * row(tuple(int(v) for v in low + c)) for c in corners)
 
 
 def _unit(x: np.ndarray) -> np.ndarray:

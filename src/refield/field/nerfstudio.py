@@ -28,6 +28,7 @@ from refield.scene.capture import Rays
 
 _LARGEST = 15.0  # up to there `truncated_exp` is exp
 _OPAQUE = 40.0  # optical depth of the sky's sample
+_BLOCK = 1 << 16  # points; some 100 MB in networks 128 wide
 SKY = 3.0
 """The sky lies so many times the far end of a ray behind what it looks like"""
 
@@ -143,7 +144,13 @@ class NerfstudioField(nn.Module):
 
     def forward(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """World points (..., 3), unit directions (..., 3) -> sigma (...,), rgb (..., 3) in [0, 1]."""
-        here, along = self._run_from_world(x.reshape(-1, 3)), d.reshape(-1, 3) @ self.turn.T
+        parts = [self._seen(*p) for p in zip(_blocks(x.reshape(-1, 3)), _blocks(d.reshape(-1, 3)))]
+        sigma, rgb = (torch.cat(each) for each in zip(*parts))
+        return sigma.reshape(x.shape[:-1]), rgb.reshape(x.shape)
+
+    def _seen(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+        """World points and directions (S, 3) -> sigma (S,), rgb (S, 3)."""
+        here, along = self._run_from_world(x), d @ self.turn.T
         sky = self._is_sky(here)
         here = torch.where(sky[:, None], here - SKY * self.config.far * along, here)
         unit, within = self._unit(here)
@@ -151,8 +158,7 @@ class NerfstudioField(nn.Module):
         rgb = self._rgb(out[:, 1:], along)
         if isinstance(self.config.sky, tuple):
             rgb = torch.where(sky[:, None], rgb.new_tensor(self.config.sky), rgb)
-        sigma = torch.where(sky, self._sky_density, self._sigma(out[:, 0]) * within)
-        return sigma.reshape(x.shape[:-1]), rgb.reshape(x.shape)
+        return torch.where(sky, self._sky_density, self._sigma(out[:, 0]) * within), rgb
 
     def _rgb(self, features: Tensor, along: Tensor) -> Tensor:
         # nerfstudio maps directions to [0, 1] for tiny-cuda-nn, which maps them back; its torch code does not
@@ -232,8 +238,8 @@ class NerfstudioField(nn.Module):
         return unit * within[:, None], within
 
     def _density_of(self, network: nn.Module, here: Tensor) -> Tensor:
-        unit, within = self._unit(here)
-        return self._sigma(network(unit, slice(1))[:, 0]) * within
+        parts = [self._unit(block) for block in _blocks(here)]
+        return torch.cat([self._sigma(network(unit, slice(1))[:, 0]) * within for unit, within in parts])
 
     def _sigma(self, raw: Tensor) -> Tensor:
         """Per world unit."""
@@ -271,6 +277,11 @@ class NerfstudioField(nn.Module):
         )
         self.sampler = replace(self.sampler, grid=found.grid)
         return self
+
+
+def _blocks(points: Tensor) -> tuple[Tensor, ...]:
+    """(S, 3) in parts small enough for what the networks make of them; one at least."""
+    return points.split(_BLOCK) if len(points) else (points,)
 
 
 def looking_everywhere(centre: Tensor, config: NerfstudioConfig) -> OccupancySampler:
