@@ -23,6 +23,7 @@ MAY_IMPORT = {
     "baselines": {"scene", "field", "vision", "update"},  # learns from what the update's supervision leaves
     "rehearse": {"scene", "field", "synthetic"},
     "check": {"scene", "field", "vision", "photos"},
+    "nerfstudio": {"scene", "field"},
     "history": {"scene", "field", "update", "workspace", "artefacts"},
     "visits": {
         "scene",
@@ -51,6 +52,7 @@ LATE = {  # extras: never when a module is loaded
     "gsply",
     "skimage",
     "fast_simplification",
+    "yaml",
 }
 
 

@@ -22,6 +22,7 @@ COMMANDS = {
     "demo": "sample capture → field → update → report; no downloads, on a CPU",
     "check": "looks photos over before any time is spent on them",
     "train": "photos, with camera poses or without → a field in a workspace",
+    "import": "a trained nerfacto of nerfstudio → a field in a workspace (needs the extra 'nerfstudio')",
     "update": "a few new photos → what changed, and the field brought up to date",
     "visits": "what changed at each update of a workspace",
     "report": "the scene's history, all visits on one page",

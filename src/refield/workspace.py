@@ -31,6 +31,7 @@ from refield.artefacts import (
     write_tensors,
 )
 from refield.field.nerfacto import NerfactoField
+from refield.field.nerfstudio import NerfstudioField
 from refield.field.radiance import HashField
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import PlacedPhoto, SceneChange
@@ -48,7 +49,9 @@ MARKER, WORLD = "refield.json", "world.json"
 FORMAT = 1
 CACHE = ".photos"
 """what structure from motion has found, kept while it goes on and for the next time; may be deleted"""
-_ARCHITECTURES: dict[str, type[HashField] | type[NerfactoField]] = {c.__name__: c for c in (HashField, NerfactoField)}
+Fitted = HashField | NerfactoField | NerfstudioField
+"""the field before any visit, of any architecture"""
+_ARCHITECTURES: dict[str, type[Fitted]] = {c.__name__: c for c in (HashField, NerfactoField, NerfstudioField)}
 _OURS = (MARKER, "capture", "field", "visits")
 
 
@@ -223,7 +226,7 @@ class Workspace:
         parts = (replace(c, frames=tuple(replace(f, name=names[f.name]) for f in c.frames)) for c in (given, found))
         write_refined(self.path / "capture" / REFINED, *parts)
 
-    def keep_field(self, field: HashField | NerfactoField, psnr: float = math.nan) -> None:
+    def keep_field(self, field: Fitted, psnr: float = math.nan) -> None:
         """Write the fitted field and, if known, its PSNR on held-out pixels (dB)."""
         tensors, facts = field.state()
         facts["held_out_psnr"] = psnr if math.isfinite(psnr) else None
@@ -234,8 +237,8 @@ class Workspace:
         known = read_json(self.path / "field" / "field.json").get("held_out_psnr")
         return float(known) if isinstance(known, int | float) else math.nan
 
-    def field(self) -> HashField | NerfactoField:
-        """The field before any visit, of either architecture."""
+    def field(self) -> Fitted:
+        """The field before any visit."""
         folder = self.path / "field"
         tensors, facts = read_tensors(folder)
         try:

@@ -28,6 +28,9 @@ _EXTRAS = {
     "synth": "path-traced worlds: refield synth",
     "sam": "SAM, LightGlue, DINOv2 with weights from a folder: --estimate.models",
     "heic": "HEIC photos, as phones take them",
+    "video": "films as MP4: refield render --out film.mp4",
+    "export": "meshes and splats: refield export",
+    "nerfstudio": "fields that nerfstudio has trained: refield import",
     "dev": "tests and checks of refield itself",
 }
 

@@ -71,7 +71,7 @@ def run(options: Train) -> Answer:
         return _answer(options.data, train_more(options.data, clock, options.fit, options.quality), clock)
     if options.work == Path():
         raise InputError("WORK", "is not given", "name the folder in which to make the workspace")
-    _check_scale(options.scale)
+    check_scale(options.scale)
     task = Sources(options.data, options.work, options.poses, options.scale)
     psnr = train(task, clock, _config_of(options), overwrite=options.overwrite, quality=options.quality)
     return _answer(options.work, psnr, clock)
@@ -229,7 +229,7 @@ def _loaded(task: Sources, clock: Clock) -> tuple[Capture, Landmarks | None]:
     return found.capture, found.landmarks
 
 
-def _check_scale(scale: float | None) -> None:
+def check_scale(scale: float | None) -> None:
     if scale is not None and not 0 < scale < 1e6:
         raise InputError("--scale", f"{scale:g} is no length", "give how many metres one unit of the world is")
 

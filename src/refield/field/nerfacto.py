@@ -7,7 +7,6 @@ points, N rays, K intervals a ray.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,16 +18,13 @@ from refield.field import kernels
 from refield.field.encoding import Contraction, geometric_levels
 from refield.field.kernels.reference import truncated_exp
 from refield.field.networks import HashNetwork, weight
-from refield.field.proposal import Density, Histogram, Plan, Span, propose
+from refield.field.proposal import Density, Histogram, Inside, Plan, Span, emptied, propose
 from refield.field.sampling import OccupancySampler
 from refield.field.stored import State, read_field, sampler_from, state_of, write_field
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
 from refield.scene.files import AnyPath, as_path
 from refield.scene.notebook import facts
-
-Inside = Callable[[Tensor], Tensor]
-"""World points (S, 3) -> whether they are inside of something, (S,) bool"""
 
 
 @dataclass(frozen=True)
@@ -147,7 +143,7 @@ class NerfactoField(nn.Module):
         with torch.no_grad():
             if without is None:
                 return self.span.samples(self.propose(rays, jitter)[1])
-            left = tuple(_outside(d, without) for d in self.densities)
+            left = tuple(emptied(d, without) for d in self.densities)
             found = self.span.samples(self.propose(rays, jitter, densities=left)[1])
             return found.only(~without(found.positions(rays)[0]))
 
@@ -196,16 +192,6 @@ class NerfactoField(nn.Module):
     def looking_where(self, grid: Tensor) -> None:
         """Replace the occupancy grid (R, R, R) uint8 that others march through; own samples do not heed it."""
         self.sampler = replace(self.sampler, grid=grid)
-
-
-def _outside(density: Density, inside: Inside) -> Density:
-    """The same density, but for where there is none."""
-
-    def left(x: Tensor) -> Tensor:
-        sigma = density(x)
-        return torch.where(inside(x), torch.zeros_like(sigma), sigma)
-
-    return left
 
 
 def looking_everywhere(contraction: Contraction, config: NerfactoConfig) -> OccupancySampler:

@@ -18,6 +18,8 @@ from refield.scene.capture import Rays
 
 Density = Callable[[Tensor], Tensor]
 """World points (S, 3) -> sigma (S,), per world unit"""
+Inside = Callable[[Tensor], Tensor]
+"""World points (S, 3) -> whether they are inside of something, (S,) bool"""
 
 
 def spacing(u: Tensor) -> Tensor:
@@ -40,9 +42,13 @@ class Span:
     """core radii"""
     radius: float
     """of the core cube, world units"""
+    even: bool = False
+    """s is even in distance, all the way"""
 
     def distance(self, s: Tensor) -> Tensor:
         """s in [0, 1], any shape -> distance along the unit direction, world units."""
+        if self.even:
+            return self.radius * (self.near + s * (self.far - self.near))
         near, far = spacing(s.new_tensor([self.near, self.far])).unbind()
         return self.radius * unspacing(near + s * (far - near))
 
@@ -130,6 +136,16 @@ def _closed(edges: Tensor) -> Tensor:
     the tests, against 31); on photos of a room the two are the same.
     """
     return torch.cat([edges, torch.ones_like(edges[:, :1])], -1)
+
+
+def emptied(density: Density, inside: Inside) -> Density:
+    """The same density, but for where there is none."""
+
+    def left(x: Tensor) -> Tensor:
+        sigma = density(x)
+        return torch.where(inside(x), torch.zeros_like(sigma), sigma)
+
+    return left
 
 
 def annealing(step: int, slope: float, steps: int) -> float:

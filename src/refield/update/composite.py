@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from refield.field.nerfacto import NerfactoField
+from refield.field.nerfstudio import NerfstudioField
 from refield.field.outlook import Outlook
 from refield.field.radiance import Field, HashField
 from refield.field.render import parted, render_camera, visible_samples
@@ -137,7 +138,7 @@ class UpdatedField:
         self.sources = tuple(source_of(pretrained, m.grid) for m in self.moves)
         self.boxes = tuple(m.box_now for m in self._shells) + region.boxes + earlier.places.boxes
         self._opaque = _DEPTH / finer(pretrained.sampler).step  # density of a plane whose texture is known
-        self._base: HashField | NerfactoField | None = _base_of(pretrained)
+        self._base: HashField | NerfactoField | NerfstudioField | None = _base_of(pretrained)
         self._own, self._nothing = self._told_cells(pretrained.sampler)
         earlier_told = pretrained._told if isinstance(pretrained, UpdatedField) else self._own
         self._told: Tensor = self._own | earlier_told
@@ -223,7 +224,7 @@ class UpdatedField:
         """
         if self._base is None or not self._marched:
             return visible_samples(self.pretrained, rays, jitter) if not self.boxes else self.sampler(rays, jitter)
-        if isinstance(self._base, NerfactoField):
+        if isinstance(self._base, NerfactoField | NerfstudioField):
             known = self._base.samples(
                 rays, jitter, without=replace(self.sampler, grid=self._retold, fine=None).occupied
             )
@@ -558,11 +559,11 @@ def _part(change: SceneChange, without: frozenset[int]) -> SceneChange:
     return change if len(kept) == len(change.objects) else replace(change, objects=kept)
 
 
-def _base_of(field: Field) -> HashField | NerfactoField | None:
+def _base_of(field: Field) -> HashField | NerfactoField | NerfstudioField | None:
     """The field of the first visit, if it is one of those that know where to look."""
     if isinstance(field, UpdatedField):
         return field._base
-    return field if isinstance(field, HashField | NerfactoField) else None
+    return field if isinstance(field, HashField | NerfactoField | NerfstudioField) else None
 
 
 def _widened(cells: Tensor) -> Tensor:

@@ -1,0 +1,1 @@
+"""In from nerfstudio: what a run of ``nerfacto`` left behind, read without running any of it."""
