@@ -15,14 +15,16 @@ import torch
 import tyro
 
 from refield.cli import COMMANDS, main
+from refield.commands import update
 from refield.commands.answer import Exit
 from refield.commands.clock import Clock
 from refield.commands.completion import script
 from refield.commands.options import Output, kind_of, names, parsed, shown
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import did_you_mean
+from refield.visits import make
 from tests.conftest import HERE, TINY_FIT
-from tests.test_cli import FEW, believing, place, update  # noqa: F401
+from tests.test_cli import FEW, believing, place  # noqa: F401
 
 OPTION = re.compile(r"--[a-z][\w.-]*")
 LONGEST = 80  # lines of a short help, on a terminal of 80 columns
@@ -112,7 +114,7 @@ def test_what_is_not_understood_has_its_own_code(place, monkeypatch, capsys):  #
         photos = tuple(PlacedPhoto(f.name, "used", "", f) for f in frames)
         return SceneChange((), photos, "who knows", unexplained=(torch.ones(24, 32, dtype=torch.bool),) * len(frames))
 
-    monkeypatch.setattr(update, "estimate_change", estimate)
+    monkeypatch.setattr(make, "estimate_change", estimate)
     document = told(capsys, "update", "work", "new", "--exit-code", code=Exit.UNCLEAR)
     assert document["not_understood"] and not document["changed"]
     assert main(["visits", "work"]) == 0
