@@ -7,7 +7,8 @@ import pytest
 import torch
 from scipy import ndimage
 
-from refield.estimate.hull import HullConfig, look_behind, on_surface, votes
+from refield.estimate.carve_kernels import Window, count_on_surface, packed
+from refield.estimate.hull import HullConfig, look_behind, votes
 from refield.estimate.lattice import Lattice, grown
 from refield.estimate.look import View
 from refield.estimate.objects import Patch
@@ -99,20 +100,30 @@ def test_what_is_behind_a_surface_is_measured_where_it_is_least(views, points):
     np.testing.assert_allclose(behind, least, atol=1e-6)
 
 
-def test_points_on_a_surface_are_found(views, points):
-    found = np.zeros(len(points), bool)
+def times_on_surface(points, views, far):
+    lenses, depths = packed(Window(v.camera, v.frame.world_from_cam, v.depth) for v in views)
+    out = np.zeros(len(points), np.uint16)
+    slack = np.array([2 * CONFIG.surface * v.pixel_angle for v in views])
+    count_on_surface(points, lenses, depths, slack, far, out)
+    return out
+
+
+@pytest.mark.parametrize("far", [1e9, 0.5])
+def test_views_that_show_a_point_on_a_surface_are_counted(views, points, far):
+    found = np.zeros(len(points), int)
     for view in views:
         seen, distance, front, _, slack = seen_by(view, points, view.depth)
-        found |= seen & (np.abs(front - distance) < 2 * slack)
-    assert 0.1 < found.mean() < 0.9
-    np.testing.assert_array_equal(on_surface(points, views, CONFIG), found)
+        nothing = np.isinf(front) & (distance > far)
+        found += seen & ((np.abs(front - distance) < 2 * slack) | nothing)
+    assert {0, 1, 2} <= set(found)
+    np.testing.assert_array_equal(times_on_surface(points, views, far), found)
 
 
 def test_without_views_nothing_is_known(points):
     assert not any(a.any() for a in votes(points, [], CONFIG))
     through, behind = look_behind(points, [], CONFIG)
     assert not through.any() and np.isinf(behind).all()
-    assert not on_surface(points, [], CONFIG).any()
+    assert not times_on_surface(points, [], 1.0).any()
 
 
 @pytest.mark.parametrize(("through", "deepest"), [(0.0, 0.3), (0.4, 0.1), (1.0, 9.0)])

@@ -29,7 +29,7 @@ def shown(view, box):
 
 def parts_of(views, masks):
     blank = np.zeros(views[0].shape)
-    changed = [Changed(v, blank, blank, m, np.zeros_like(m)) for v, m in zip(views, masks)]
+    changed = [Changed(v, blank, blank, m, *np.zeros((2, *m.shape), bool)) for v, m in zip(views, masks)]
     lattice = Lattice.over(np.array([-0.7, -0.5, -0.05], np.float32), np.array([0.8, 0.8, 0.7], np.float32), 60)
     carved = carve(lattice, list(zip(views, masks)), views, HullConfig())
     above = lattice.centres[..., 2] > 0.01

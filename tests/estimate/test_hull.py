@@ -34,7 +34,7 @@ def true_mask(view):
 
 def test_no_mask_no_region(views):
     nothing = np.zeros(views[0].shape, bool)
-    assert find_region([Changed(v, nothing, nothing, nothing, nothing) for v in views], HullConfig()) is None
+    assert find_region([Changed(v, nothing, nothing, nothing, nothing, nothing) for v in views], HullConfig()) is None
 
 
 def test_the_floor_holds_up_and_the_lid_does_not(views):

@@ -63,7 +63,7 @@ def stage(tmp_path_factory):
     (old,) = recipe._were_there(
         scene, carved, changed_parts(scene.changed, carved, free, 40, scene.models.segmenter)[0]
     )
-    past = look_past(BEFORE, scene.changed, scene.survey, [old], (config.detect, config.hull))
+    past = look_past(BEFORE, scene.changed, scene.errors.memory, [old], (config.detect, config.hull))
     return Stage(scene, old, past, capture, frames)
 
 
@@ -94,7 +94,7 @@ def test_looking_past_it_heeds_how_near_to_a_surface_is_on_it(stage):
     for surface in (HullConfig().surface, 1e4):
         ground = SimpleNamespace(
             field=BEFORE,
-            survey=stage.scene.survey,
+            memory=stage.scene.errors.memory,
             detect=stage.scene.config.detect,
             carving=HullConfig(surface=surface),
             believe=AssociateConfig(),
@@ -189,7 +189,7 @@ def test_an_object_behind_everything_is_not_shown_and_breaks_nothing(stage):
 def test_the_outline_of_a_moved_object_is_whole_in_photos_larger_than_the_working_size(stage):
     config = recipe.EstimateConfig(survey=6, max_pixels=1200)
     small = recipe._detected(stage.capture, BEFORE, stage.frames, config, Models())
-    past = look_past(BEFORE, small.changed, small.survey, [stage.old], (config.detect, config.hull))
+    past = look_past(BEFORE, small.changed, small.errors.memory, [stage.old], (config.detect, config.hull))
     found = refine(Sight(BEFORE, stage.old, past, [stage.old]), TRUE)
     sight = Sight(BEFORE, stage.old, take_off(BEFORE, past, stage.old, found), [stage.old])
     masks = _shown_in(sight, found.new_from_old)

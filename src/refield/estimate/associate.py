@@ -26,6 +26,7 @@ from refield.estimate.layers import Sight
 from refield.estimate.light import even_and_grey, log_ratio
 from refield.estimate.look import Array, View
 from refield.estimate.matched import matched_poses
+from refield.estimate.memory import Memory
 from refield.estimate.objects import Old
 from refield.estimate.outline import FEWEST_POINTS, ObjectConfig, restricted
 from refield.estimate.past import Past, changed_share, gone_score, look_past, silhouette
@@ -94,6 +95,7 @@ class Ground:
     planes: Sequence[Plane]
     """what holds things up"""
     survey: Sequence[View]
+    memory: Memory
     photographed: Sequence[Frame]
     """old photos that show the old state as it was"""
     detect: DetectConfig
@@ -133,7 +135,7 @@ class Fit:
 def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> Settled:
     """Find each old object's new place or that it left, and what else arrived."""
     touched = [k for k, old in enumerate(olds) if changed_share(changed, old) >= ground.believe.touched]
-    views = look_past(ground.field, changed, ground.survey, [olds[k] for k in touched], (ground.detect, ground.carving))
+    views = look_past(ground.field, changed, ground.memory, [olds[k] for k in touched], (ground.detect, ground.carving))
     moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, views)
     trimmed_some = any(placed[k] is not olds[k] for k in touched)
     olds = [placed.get(k, old) for k, old in enumerate(olds)]
@@ -142,7 +144,7 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
     kept = [k for k in touched if k in moved or k in removed]
     if len(kept) < len(touched) or trimmed_some:  # what never left hides what is behind it after all
         views = look_past(
-            ground.field, changed, ground.survey, [olds[k] for k in kept], (ground.detect, ground.carving)
+            ground.field, changed, ground.memory, [olds[k] for k in kept], (ground.detect, ground.carving)
         )
         for k, change in moved.items():
             views = take_off(ground.field, views, olds[k], change)
@@ -177,7 +179,7 @@ def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
     """Whether an object's pixels changed and show what was behind it."""
     if changed_share(changed, old) < ground.believe.touched:
         return False
-    views = look_past(ground.field, changed, ground.survey, [old], (ground.detect, ground.carving))
+    views = look_past(ground.field, changed, ground.memory, [old], (ground.detect, ground.carving))
     return _gone(ground, views, old) is not None
 
 
@@ -230,7 +232,7 @@ def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> Voxel
     """Voxels that newcomers may fill: in every seeing view's unexplained change, and empty once the old are gone."""
     hull, config = ground.hull, ground.carving
     points = hull.lattice.centres.reshape(-1, 3)
-    seen = [(replace(p.view, depth=p.depth), p.changed.mask & ~p.explained) for p in past]
+    seen = [(p.changed.witness(p.depth), p.changed.mask & ~p.explained) for p in past]
     inside, against = votes(points, [(v, pixels.dilate(m, config.margin)) for v, m in seen], config)
     sure, _ = votes(points, [(v, pixels.dilate(p.open, 1)) for (v, _), p in zip(seen, past)], config)
     air = ~hull.solid.reshape(-1)
@@ -418,7 +420,7 @@ def trimmed(ground: Ground, sight: Sight, change: PoseChange) -> tuple[Old, Pose
     places = old.lattice.centres[old.voxels]
     now = transform(change.new_from_old, torch.from_numpy(places)).numpy()
     seen = [
-        (replace(p.view, depth=p.depth), pixels.dilate(p.changed.mask | p.changed.light | p.covered | ~p.known, 2))
+        (p.changed.witness(p.depth), pixels.dilate(p.changed.mask | p.changed.light | p.covered | ~p.known, 2))
         for p in past
     ]
     _, against = votes(now, seen, ground.carving)

@@ -109,15 +109,16 @@ def find_behind(points: _F32, lenses: _F64, depths: _F32, slack: _F64, through: 
 
 
 @njit(parallel=True, **_JIT)
-def find_on_surface(points: _F32, lenses: _F64, depths: _F32, slack: _F64, out: _Bool) -> None:
-    """``out`` (N,): whether a point lies on the surface that some window shows."""
+def count_on_surface(points: _F32, lenses: _F64, depths: _F32, slack: _F64, far: float, out: _Count) -> None:
+    """``out`` (N,): the windows that show a surface where each point lies; of points beyond ``far``, those that show
+    nothing there."""
     for n in prange(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         for v in range(len(lenses)):
             at, distance = _look(lenses[v], x, y, z)
-            if at >= 0 and abs(depths[at] - distance) < slack[v] * distance:
-                out[n] = True
-                break
+            if at >= 0:
+                front = depths[at]
+                out[n] += abs(front - distance) < slack[v] * distance or (front == np.inf and distance > far)
 
 
 @njit(parallel=True, **_JIT)

@@ -43,6 +43,8 @@ class Told:
     photos: tuple[PlacedPhoto, ...]
     """all of the new ones; ``changed`` and the settled views go with those that are used"""
     carved: Hull
+    usual: float
+    """the largest part of a photo of the old state that would be taken for changed, see `detect.Errors`"""
 
 
 def concluded(scene: Told, settled: Settled) -> SceneChange:
@@ -69,12 +71,14 @@ def concluded(scene: Told, settled: Settled) -> SceneChange:
     return SceneChange(tuple(changes), scene.photos, "; ".join(reasons), ins, outs, unexplained)
 
 
-def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...]) -> SceneChange:
-    """The answer where the photos' changes meet nowhere in space; told if they are more than the odd spot."""
+def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...], usual: float) -> SceneChange:
+    """The answer where the photos' changes meet nowhere in space; told if they are more than the odd spot, and more
+    than is ``usual`` in photos that show no change."""
     why = "the pixels that differ agree on no place that more than one photo shows"
-    if max(float(c.mask.mean()) for c in changed) < _LARGE:
+    shares = [float(c.mask.mean()) for c in changed]
+    if max(shares) < _LARGE or float(np.mean(shares)) <= usual:
         return SceneChange((), photos, why)
-    share = 100 * float(np.mean([c.mask.mean() for c in changed]))
+    share = 100 * float(np.mean(shares))
     why += f"; {share:.0f} % of the photos' pixels are not understood: do the photos show one and the same state?"
     return SceneChange((), photos, why, unexplained=tuple(full_size(c.mask, c.view.frame) for c in changed))
 
@@ -121,7 +125,8 @@ def _fresh(settled: Settled, lattice: Lattice, part: Voxels) -> float:
 
 
 def _unexplained(scene: Told, settled: Settled) -> list[Mask]:
-    """Per photo, the changed pixels that nothing accounts for; nothing at all if they are few."""
+    """Per photo, the changed pixels that nothing accounts for; nothing at all if they are few, beside the others or
+    beside what the field gets wrong in photos that show no change."""
     out = []
     for c, p in zip(scene.changed, settled.views):
         told = pixels.dilate(p.covered, 3) | p.explained | ~p.known
@@ -133,7 +138,8 @@ def _unexplained(scene: Told, settled: Settled) -> list[Mask]:
         left = pixels.dilate(pixels.erode(left, 1), 1) & left
         out.append(pixels.keep_components(left, max(12, _NOTABLE * left.size)))
     unclear, changed = (sum(int(m.sum()) for m in masks) for masks in (out, [c.mask for c in scene.changed]))
-    return out if unclear > _MUCH * changed else []
+    unusual = float(np.mean([m.mean() for m in out])) > scene.usual
+    return out if unclear > _MUCH * changed and unusual else []
 
 
 def _said_of(scene: Told, left: Sequence[Mask]) -> str:

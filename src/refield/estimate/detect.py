@@ -1,7 +1,8 @@
 """Which pixels of the new photos show something else than the old field does (§4.2.2), and which of those only light.
 
-The threshold is absolute: what the field gets wrong on the old photos, looked up where each new pixel's surface lies,
-is no change. Otsu's level only sharpens it where the contrast is high. So "nothing changed" can be the answer.
+The threshold is absolute: what the field gets wrong in photos of the old state, at the surface under a pixel and where
+as few old photos looked as there, is no change. Otsu's level only sharpens it where the contrast is high. So "nothing
+changed" can be the answer. What no old photo saw is no change either, whatever is there.
 """
 
 from __future__ import annotations
@@ -14,9 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refield.estimate.look import Array, View
+from refield.estimate.memory import Memory
 from refield.vision import pixels
 
 Mask = NDArray[Any]
+_CLASSES = 5
+_ENOUGH = 3  # photos that tell more of the field's errors than those that it was fitted to
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,29 @@ class Changed:
     """(H, W) changed, light set aside"""
     light: Mask
     """(H, W) brighter or darker, on a surface that stayed"""
+    new: Mask
+    """(H, W) what is there was seen by no old photo, and is not what the field took for granted: no change, as far as
+    anyone knows"""
+
+    def witness(self, depth: Array | None = None) -> View:
+        """The view, with the old surface at ``depth`` (H, W), for telling where in space nothing changed: pixels that
+        show what is new to us tell of no place."""
+        return replace(self.view, depth=np.where(self.new, 0, self.view.depth if depth is None else depth))
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What the field gets wrong where nothing changed."""
+
+    shown: tuple[Changed, ...]
+    """photos of the old state"""
+    memory: Memory
+    levels: Array
+    """(C,) Lab units by the class of coverage, see `_coverage`: what is larger may be part of a change"""
+    seeds: Array
+    """(C,) a change is larger than this somewhere"""
+    usual: float = 0.0
+    """the largest part of one of those photos that would be taken for changed if it were new"""
 
 
 def blur_sigma(view: View, config: DetectConfig) -> float:
@@ -98,31 +125,69 @@ def noise_at(view: View, survey: Sequence[Changed]) -> Array:
     return mean.reshape(view.shape)
 
 
-def survey_noise(survey: Sequence[View], config: DetectConfig) -> list[Changed]:
-    """The field's own errors on old photos."""
-    out = []
-    for view in survey:
-        view = carried(view, config)
-        nothing = np.zeros(view.shape, bool)
-        diff = difference(view, config)
-        out.append(Changed(view, diff, np.full(view.shape, np.inf, np.float32), nothing, nothing))
+def errors(field_photos: Sequence[View], others: Sequence[View], memory: Memory, config: DetectConfig) -> Errors:
+    """The field's own errors.
+
+    Args:
+        field_photos: old photos that it was fitted to; it is better there than elsewhere.
+        others: old photos that it was not. If there are too few, the former stand in.
+    """
+    fitted, unseen = ([_unchanged(v, config) for v in views] for views in (field_photos, others))
+    asked = unseen if len(unseen) >= _ENOUGH else [*fitted, *unseen]
+    of = np.concatenate([_coverage(memory.times_seen(s.view)).ravel() for s in asked])
+    known = np.concatenate([s.difference.ravel() for s in asked])
+    levels, seeds = (_by_coverage(known, of, q) for q in (config.noise_quantile, config.seed_quantile))
+    levels, seeds = np.maximum(config.floor, levels), 1.3 * np.maximum(config.floor, seeds)
+    shown = (*fitted, *unseen)
+    shares = [0.0]
+    for one in asked:
+        others_than = Errors(tuple(s for s in shown if s is not one), memory, levels, seeds)
+        (found,) = _marked([one.view], [one.difference], others_than, config)
+        shares.append(float(found.mask.mean()))
+    return Errors(shown, memory, levels, seeds, max(shares))
+
+
+def _unchanged(view: View, config: DetectConfig) -> Changed:
+    view = carried(view, config)
+    nothing = np.zeros(view.shape, bool)
+    none = np.full(view.shape, np.inf, np.float32)
+    return Changed(view, difference(view, config), none, nothing, nothing, nothing)
+
+
+def _coverage(times: NDArray[Any]) -> NDArray[np.int64]:
+    """The class of what so many old photos saw: none, one, 2 or 3, 4 to 7, more."""
+    return np.minimum(np.frexp(times)[1], _CLASSES - 1).astype(np.int64)
+
+
+def _by_coverage(errors: Array, of: NDArray[np.int64], quantile: float) -> Array:
+    """A quantile of errors (N,) for each class of coverage, (C,), no smaller than that of all, nor than that of what
+    more photos saw."""
+    fewest = 1 / (1 - quantile)  # that have one among them
+    out: Array = np.full(_CLASSES, np.quantile(errors, quantile) if len(errors) else 0.0)
+    for k in reversed(range(_CLASSES)):
+        mine = errors[of == k]
+        out[k] = max(float(np.quantile(mine, quantile)) if len(mine) >= fewest else 0.0, *out[k:])
     return out
 
 
-def changes(views: Sequence[View], survey: Sequence[Changed], config: DetectConfig) -> list[Changed]:
+def changes(views: Sequence[View], known: Errors, config: DetectConfig) -> list[Changed]:
     """Change masks of the new photos; light not yet set aside."""
     views = [carried(v, config) for v in views]
-    diffs = [difference(v, config) for v in views]
-    known = np.concatenate([s.difference.ravel() for s in survey]) if survey else np.zeros(1)
-    level = max(config.floor, float(np.quantile(known, config.noise_quantile)))
-    seed_level = max(1.3 * config.floor, 1.3 * float(np.quantile(known, config.seed_quantile)))
-    above = np.concatenate([d[d > level] for d in diffs])
-    seed_level = max(seed_level, config.otsu_share * pixels.otsu(above, 60.0)) if len(above) else seed_level
+    return _marked(views, [difference(v, config) for v in views], known, config)
+
+
+def _marked(views: Sequence[View], diffs: Sequence[Array], known: Errors, config: DetectConfig) -> list[Changed]:
+    """Change masks of photos whose colours are carried over and whose differences (H, W) are known."""
+    times = [known.memory.times_seen(v) for v in views]
+    floors = [known.levels[_coverage(t)] for t in times]
+    above = np.concatenate([d[(d > f) & (t > 0)] for d, f, t in zip(diffs, floors, times)])
+    strong = config.otsu_share * pixels.otsu(above, 60.0) if len(above) else 0.0
     out = []
-    for view, diff in zip(views, diffs):
-        threshold = np.maximum(level, config.local_factor * noise_at(view, survey)).astype(np.float32)
-        smallest = max(6, config.smallest * diff.size)
-        mask = pixels.keep_components(diff > threshold, smallest, diff > np.maximum(seed_level, threshold))
-        mask = pixels.fill_holes(pixels.close(mask, 2 * round(0.012 * view.camera.width) + 3), 8 * smallest)
-        out.append(Changed(view, diff, threshold, mask, np.zeros_like(mask)))
+    for view, diff, floor, seen in zip(views, diffs, floors, times):
+        threshold = np.maximum(floor, config.local_factor * noise_at(view, known.shown)).astype(np.float32)
+        seeds = diff > np.maximum(np.maximum(known.seeds[_coverage(seen)], strong), threshold)
+        smallest, new = max(6, config.smallest * diff.size), (seen == 0) & (diff > threshold)
+        mask = pixels.keep_components((diff > threshold) & ~new, smallest, seeds & ~new)
+        mask = pixels.fill_holes(pixels.close(mask, 2 * round(0.012 * view.camera.width) + 3), 8 * smallest) & ~new
+        out.append(Changed(view, diff, threshold, mask, np.zeros_like(mask), new))
     return out

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from refield.estimate.carve_kernels import Window, count_votes, find_behind, find_on_surface, packed
+from refield.estimate.carve_kernels import Window, count_votes, find_behind, packed
 from refield.estimate.detect import Changed, Mask
 from refield.estimate.lattice import Lattice, Voxels
 from refield.estimate.look import Array, View
@@ -78,14 +78,6 @@ def look_behind(points: Array, views: Sequence[View], config: HullConfig) -> tup
     return through, behind
 
 
-def on_surface(points: Array, views: Sequence[View], config: HullConfig) -> NDArray[np.bool_]:
-    """Whether each point (N, 3) is within two tolerances of the old surface that some view looks at."""
-    lenses, depths, slack = _windows(views, config)
-    found = np.zeros(len(points), bool)
-    find_on_surface(_rows(points), lenses, depths, 2 * slack, found)
-    return found
-
-
 def _rows(points: Array) -> Array:
     return np.ascontiguousarray(points, np.float32)
 
@@ -98,7 +90,7 @@ def _windows(views: Sequence[View], config: HullConfig) -> tuple[Array, Array, A
 
 def find_region(changed: Sequence[Changed], config: HullConfig) -> Lattice | None:
     """The lattice that holds everything that may be in the hull; None if no point can be."""
-    seen = [(c.view, pixels.dilate(c.mask, config.margin)) for c in changed]
+    seen = [(c.witness(), pixels.dilate(c.mask, config.margin)) for c in changed]
     needed = min(2, len(changed))
     kept = []
     for c in changed:

@@ -15,9 +15,10 @@ import numpy as np
 import torch
 
 from refield.estimate.detect import Changed, DetectConfig, Mask, blur_sigma
-from refield.estimate.hull import HullConfig, on_surface, tolerance
+from refield.estimate.hull import HullConfig, tolerance
 from refield.estimate.lattice import grown
 from refield.estimate.look import Array, Hidden, View, see
+from refield.estimate.memory import Memory
 from refield.estimate.objects import Old
 from refield.field.radiance import Field
 from refield.vision import pixels
@@ -63,18 +64,18 @@ class Past:
 def look_past(
     field: Field,
     changed: Sequence[Changed],
-    survey: Sequence[View],
+    memory: Memory,
     olds: Sequence[Old],
     configs: tuple[DetectConfig, HullConfig],
 ) -> list[Past]:
     """Render the new views without ``olds``; only rays that meet one are traced again."""
-    return [_look_past(field, c, survey, olds, configs) for c in changed]
+    return [_look_past(field, c, memory, olds, configs) for c in changed]
 
 
 def _look_past(
     field: Field,
     c: Changed,
-    survey: Sequence[View],
+    memory: Memory,
     olds: Sequence[Old],
     configs: tuple[DetectConfig, HullConfig],
 ) -> Past:
@@ -91,20 +92,11 @@ def _look_past(
     hit = np.abs(np.where(np.isfinite(depth), depth, 0) - np.where(np.isfinite(view.depth), view.depth, 0))
     gone = was & (hit > tolerance(view, np.where(np.isfinite(view.depth), view.depth, 0), carving))
     gone = pixels.close(gone, 3)
-    guess = was & ~(_seen_before(view, depth, survey, carving) & ~_beneath(view, depth, olds))
+    guess = was & ((memory.times_seen(view, depth) == 0) | _beneath(view, depth, olds))
     known = ~pixels.dilate(pixels.close(guess, 3), 1)
     sigma = blur_sigma(view, config)
     diff = pixels.colour_difference(pixels.blur(view.photo, sigma), pixels.blur(rgb, sigma), config.reach)
     return Past(c, rgb, depth, gone, known, diff, np.zeros(view.shape, bool), depth)
-
-
-def _seen_before(view: View, depth: Array, survey: Sequence[View], carving: HullConfig) -> Mask:
-    """Pixels whose surface at ``depth`` some old view looks at."""
-    with np.errstate(invalid="ignore"):
-        points = (view.centre + view.directions * depth[..., None]).reshape(-1, 3)
-    finite = np.all(np.isfinite(points), axis=-1)
-    # an empty sky is known too: nothing was ever seen there
-    return (on_surface(points, survey, carving) | ~finite).reshape(view.shape)
 
 
 def _beneath(view: View, depth: Array, olds: Sequence[Old]) -> Mask:

@@ -12,11 +12,12 @@ import torch
 from refield.estimate import associate, detect, hull, light, look
 from refield.estimate.associate import AssociateConfig, Ground, Settled, is_crumb, looks_gone, unexplained
 from refield.estimate.conclude import Told, concluded, disagreeing
-from refield.estimate.detect import Changed, DetectConfig
+from refield.estimate.detect import Changed, DetectConfig, Errors
 from refield.estimate.faces import changed_parts
 from refield.estimate.hull import Hull, HullConfig
 from refield.estimate.lattice import Lattice, Voxels, grown
 from refield.estimate.look import Array, View
+from refield.estimate.memory import Memory
 from refield.estimate.models import ModelConfig, Models
 from refield.estimate.objects import Old
 from refield.estimate.outline import ObjectConfig, Seeds, outline, remembered
@@ -76,6 +77,7 @@ class _Scene:
     field: Field
     config: EstimateConfig
     survey: tuple[View, ...]
+    errors: Errors
     changed: tuple[Changed, ...]
     photos: tuple[PlacedPhoto, ...]
     """all of the new ones; ``changed`` goes with those that are used"""
@@ -125,7 +127,7 @@ def estimate_change(
     say("hull")
     region = hull.find_region(scene.changed, config.hull)
     if region is None:
-        answer = disagreeing(scene.changed, photos)
+        answer = disagreeing(scene.changed, photos, scene.errors.usual)
         return replace(answer, why=answer.why + _light(photos))
     carved, free = _carved(scene, region)
     things, others = changed_parts(scene.changed, carved, free, config.hull.smallest, models.segmenter)
@@ -134,24 +136,25 @@ def estimate_change(
     up = scene.planes[0].normal if scene.planes else _up(capture)
     photographed = [f for f in capture.frames if f.made is None]
     ground = Ground(
-        field, carved, free, up, scene.planes, scene.survey, photographed, config.detect, config.hull, config.objects,
-        config.associate, config.register, config.refine, models.matcher,
+        field, carved, free, up, scene.planes, scene.survey, scene.errors.memory, photographed,
+        config.detect, config.hull, config.objects, config.associate, config.register, config.refine, models.matcher,
     )  # fmt: skip
     settled = associate.settle(ground, olds, scene.changed)
     more = _overlooked(scene, ground, settled, (things, others), olds) if things else []
     if more:
         settled = associate.settle(ground, _whole([*olds, *more]), scene.changed)
     say("segment")
-    return concluded(Told(field, capture.train, scene.changed, photos, carved), settled)
+    return concluded(Told(field, capture.train, scene.changed, photos, carved, scene.errors.usual), settled)
 
 
 def _detected(
     capture: Capture, field: Field, frames: Sequence[Frame], config: EstimateConfig, models: Models
 ) -> _Scene:
     views = [_placed(field, f, config) for f in frames]
-    survey = [look.view_of(field, f, config.max_pixels) for f in look.spread_out(capture.frames, config.survey)]
-    noise = detect.survey_noise(survey, config.detect)
-    changed = detect.changes(views, noise, config.detect)
+    survey = [look.view_of(field, f, config.max_pixels) for f in look.spread_out(capture.train, config.survey)]
+    others = [look.view_of(field, f, config.max_pixels) for f in look.spread_out(capture.held_out, config.survey)]
+    errors = detect.errors(survey, others, Memory.of(field, capture.train), config.detect)
+    changed = detect.changes(views, errors, config.detect)
     shares = [float(c.mask.mean()) for c in changed]
     photos = tuple(_verdict(c.view, share, config.most_changed) for c, share in zip(changed, shares))
     if all(p.status == "rejected" for p in photos):
@@ -160,10 +163,11 @@ def _detected(
         raise InputError("new photos", what, give)
     if any(p.status == "rejected" for p in photos):
         used = [v for v, p in zip(views, photos) if p.status == "used"]
-        changed = detect.changes(used, noise, config.detect)
-    planes = _planes([n.view for n in noise], changed)
+        changed = detect.changes(used, errors, config.detect)
+    survey = [s.view for s in errors.shown]
+    planes = _planes(survey, changed)
     changed = light.set_light_aside(changed, planes, config.detect)
-    return _Scene(capture, field, config, tuple(n.view for n in noise), tuple(changed), photos, planes, models, ())
+    return _Scene(capture, field, config, tuple(survey), errors, tuple(changed), photos, planes, models, ())
 
 
 def _placed(field: Field, frame: Frame, config: EstimateConfig) -> View:
@@ -213,7 +217,7 @@ def _carved(scene: _Scene, region: Lattice) -> tuple[Hull, Voxels]:
     """The change hull, and the voxels in front of what holds things up."""
     config = scene.config.hull
     old = [*scene.survey, *(c.view for c in scene.changed)]
-    carved = hull.carve(region, [(c.view, c.mask) for c in scene.changed], old, config)
+    carved = hull.carve(region, [(c.witness(), c.mask) for c in scene.changed], old, config)
     free = np.ones(region.shape, bool)
     for plane in scene.planes:
         free &= plane.height(region.centres) > max(0.5 * region.cell, plane.noise)

@@ -24,7 +24,7 @@ def newcomer_grid(came: Thing, old: Sequence[View], config: HullConfig) -> Occup
         old: renderings of the old field, which tell what was empty.
     """
     changed = [
-        Changed(s.pair.view, s.pair.unlike, np.zeros_like(s.pair.unlike), s.mask, np.zeros_like(s.mask))
+        Changed(s.pair.view, s.pair.unlike, np.zeros_like(s.pair.unlike), s.mask, *np.zeros((2, *s.mask.shape), bool))
         for s in came.sightings
     ]
     region = find_region(changed, config)

@@ -1,0 +1,100 @@
+"""What old photos saw: counted, and where they never looked nothing is a change."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from refield.estimate import detect
+from refield.estimate.detect import DetectConfig
+from refield.estimate.look import view_of
+from refield.estimate.memory import Memory
+from refield.estimate.recipe import EstimateConfig, estimate_change
+from refield.scene.capture import Capture
+from tests.estimate.boxes import BoxWorld, camera_at, photograph, standing
+
+CRATE = standing((0.2, 0.17, 0.18), -0.1, -0.1, 20)
+BEHIND = standing((0.1, 0.1, 0.12), -0.75, 0.0, 0)
+OLD, NEW = BoxWorld((CRATE,)), BoxWorld((CRATE, BEHIND))
+ONE_SIDE = [camera_at(angle, 34) for angle in range(-30, 31, 10)]
+AROUND = [camera_at(angle, 34) for angle in range(0, 360, 30)]
+
+
+def views_of(world, folder, poses):
+    return [view_of(OLD, f, 10_000) for f in photograph(world, folder, poses)]
+
+
+def test_photos_that_saw_a_surface_are_counted(tmp_path):
+    frames = photograph(OLD, tmp_path, AROUND)
+    memory = Memory.of(OLD, frames)
+    (view,) = views_of(OLD, tmp_path / "new", [camera_at(10, 34)])
+    times = memory.times_seen(view)
+    on_crate = CRATE.inside(torch.nan_to_num(torch.from_numpy(view.surface + 0.02 * view.directions))).numpy()
+    floor = np.isfinite(view.depth) & ~on_crate
+    # of a convex thing half of the cameras around it see a side; its floor all see but those that it hides it from
+    assert 2 <= np.median(times[on_crate]) <= 8 < np.median(times[floor]) <= len(frames)
+
+
+def test_a_side_that_no_photo_saw_is_not_seen_and_the_same_with_one_more_is(tmp_path):
+    behind = camera_at(180, 34)
+    (view,) = views_of(OLD, tmp_path / "new", [behind])
+    on_crate = CRATE.inside(torch.nan_to_num(torch.from_numpy(view.surface + 0.02 * view.directions))).numpy()
+    top = np.abs(view.surface[..., 2] - view.surface[on_crate][:, 2].max()) < 0.02
+    side = on_crate & ~top & (view.surface[..., 2] > 0.05)
+    assert side.sum() > 50
+    for poses, seen in ((ONE_SIDE, False), ([*ONE_SIDE, behind], True)):
+        times = Memory.of(OLD, photograph(OLD, tmp_path / f"{seen}", poses)).times_seen(view)
+        assert (np.median(times[side]) > 0) == seen
+        assert np.median(times[on_crate & top]) >= len(ONE_SIDE) - 1
+
+
+def test_where_all_photos_show_nothing_nothing_was_seen(tmp_path):
+    """A sky is known to be empty; that it is still empty is no news, and what stands in it is."""
+    frames = photograph(OLD, tmp_path, AROUND)
+    (view,) = views_of(OLD, tmp_path / "new", [camera_at(10, 34)])
+    empty = replace(view, depth=np.full(view.shape, np.inf, np.float32))
+    usual = Memory.of(OLD, frames)
+    sky = replace(usual, depths=np.full_like(usual.depths, np.inf))
+    assert np.median(sky.times_seen(empty)) > 0
+    thing = replace(view, depth=np.full(view.shape, 1.0, np.float32))
+    assert not sky.times_seen(thing).any()
+
+
+@pytest.mark.parametrize("poses", [ONE_SIDE, AROUND])
+def test_what_no_photo_saw_is_new_and_no_change(tmp_path, poses):
+    """A crate's back is painted otherwise than the field takes for granted."""
+    capture = Capture(tuple(photograph(OLD, tmp_path / "old", poses)), held_out_every=3)
+    behind = [camera_at(angle, 30) for angle in (170, 180, 190)]
+    views = views_of(OLD, tmp_path / "new", behind)
+    memory, config = Memory.of(OLD, capture.train), DetectConfig()
+    fitted, others = ([view_of(OLD, f, 10_000) for f in some] for some in (capture.train, capture.held_out))
+    errors = detect.errors(fitted, others, memory, config)
+    for view in views:
+        on_crate = CRATE.inside(torch.nan_to_num(torch.from_numpy(view.surface + 0.02 * view.directions))).numpy()
+        side = on_crate & (view.surface[..., 2] < 0.14)
+        painted = replace(view, photo=np.where(side[..., None], 1 - view.photo, view.photo).astype(np.float32))
+        (found,) = detect.changes([painted], errors, config)
+        core = side & (memory.times_seen(view) == 0) if poses is ONE_SIDE else side
+        assert core.sum() > 50
+        assert found.mask[core].mean() < 0.01 if poses is ONE_SIDE else found.mask[core].mean() > 0.7
+        assert (found.new[core].mean() > 0.7) == (poses is ONE_SIDE)
+        assert (found.witness().depth[found.new] == 0).all()
+
+
+def test_an_arrival_in_front_of_what_was_seen_is_found(tmp_path):
+    capture = Capture(tuple(photograph(OLD, tmp_path / "old", AROUND)), held_out_every=4)
+    photos = photograph(NEW, tmp_path / "new", [camera_at(angle, 34) for angle in (90, 135, 180, 225)])
+    change = estimate_change(capture, OLD, photos, EstimateConfig(survey=6))
+    assert [o.kind for o in change.objects] == ["added"]
+
+
+def test_errors_grow_where_fewer_photos_looked_and_never_shrink():
+    rng = np.random.default_rng(0)
+    of = rng.integers(0, 5, 50_000)
+    wrong = rng.exponential(1.0, len(of)) * np.array([8, 4, 6, 1, 1])[of]
+    levels = detect._by_coverage(wrong, of, 0.9)
+    assert (np.diff(levels) <= 0).all() and levels[0] > 1.2 * levels[1] > 0
+    assert levels[-1] == np.quantile(wrong, 0.9)
+    few = detect._by_coverage(wrong[:9], np.zeros(9, int), 0.9)
+    assert (few == few[-1]).all()
