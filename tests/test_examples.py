@@ -28,6 +28,7 @@ from refield.visits import opened
 from refield.visits.make import VisitConfig
 from tests.changed import FIT, FIT_OPTIONS, Changed, write_changed
 
+pytestmark = pytest.mark.chain  # a minute or two in all
 ROOT = Path(__file__).parent.parent
 FEW = UpdateConfig(steps=40)
 COARSE = EstimateConfig(

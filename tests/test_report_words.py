@@ -164,8 +164,10 @@ def test_headlines() -> None:
 def test_every_stage_of_an_update_has_words() -> None:
     source = Path(__file__).parents[1] / "src/refield"
     files = [*(source / "estimate").rglob("*.py"), *(source / "update").glob("*.py")]
-    files += [source / "commands" / f"{n}.py" for n in ("update", "placing", "train")]
-    called = {n for f in files for n in re.findall(r"\b(?:say|clock\.stage)\(\"([^\"]+)\"\)", f.read_text())}
+    files += [*(source / "visits").glob("*.py"), source / "commands" / "train.py"]
+    called = {
+        n for f in files for n in re.findall(r"\b(?:say|clock\.stage|telling\.stage)\(\"([^\"]+)\"\)", f.read_text())
+    }
     assert len(called) > 12
     assert [n for n in called if stage(n) == n] == []
 

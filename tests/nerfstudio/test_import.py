@@ -20,11 +20,11 @@ from refield.scene.capture import camera_rays
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
 from refield.scene.images import read_image
 from refield.scene.pose import rotation_log
+from refield.visits import make
 from refield.workspace import Workspace
 from tests.nerfstudio.runs import PHOTOS, Theirs, Written, write_checkpoint, write_run
 
 pytest.importorskip("yaml")
-update = pytest.importorskip("refield.commands.update")
 COARSE = ["--occupancy", "16"]
 KINDS = {"torch": {}, "legacy": {"legacy": True}, "packed": {"packed": True}}
 
@@ -192,7 +192,7 @@ def test_a_workspace_like_any_other(run, monkeypatch, capsys):
     assert np.abs(read_image(Path("before/005.png"))[y, x].numpy() / 255 - known).max() < 1 / 255
 
     middle = torch.stack([f.centre for f in run.capture.frames]).mean(0).float()
-    monkeypatch.setattr(update, "estimate_change", _something_moved(middle))
+    monkeypatch.setattr(make, "estimate_change", _something_moved(middle))
     shutil.copytree("photos", "new")
     told = json.loads(Path("new/transforms.json").read_text())
     Path("new/transforms.json").write_text(json.dumps({**told, "frames": told["frames"][:4]}))

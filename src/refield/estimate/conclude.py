@@ -13,7 +13,7 @@ from torch import Tensor
 
 from refield.estimate import past, segment
 from refield.estimate.associate import Settled, shadow_of
-from refield.estimate.detect import Changed, Mask
+from refield.estimate.detect import Changed, Errors, Mask
 from refield.estimate.hull import Hull
 from refield.estimate.lattice import Lattice, Voxels
 from refield.estimate.layers import Sight, layers_at
@@ -43,8 +43,8 @@ class Told:
     photos: tuple[PlacedPhoto, ...]
     """all of the new ones; ``changed`` and the settled views go with those that are used"""
     carved: Hull
-    usual: float
-    """the largest part of a photo of the old state that would be taken for changed, see `detect.Errors`"""
+    errors: Errors
+    """what the field gets wrong where nothing changed"""
 
 
 def concluded(scene: Told, settled: Settled) -> SceneChange:
@@ -71,12 +71,12 @@ def concluded(scene: Told, settled: Settled) -> SceneChange:
     return SceneChange(tuple(changes), scene.photos, "; ".join(reasons), ins, outs, unexplained)
 
 
-def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...], usual: float) -> SceneChange:
+def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...], errors: Errors) -> SceneChange:
     """The answer where the photos' changes meet nowhere in space; told if they are more than the odd spot, and more
-    than is ``usual`` in photos that show no change."""
+    than the field's ``errors`` are in photos that show no change."""
     why = "the pixels that differ agree on no place that more than one photo shows"
     shares = [float(c.mask.mean()) for c in changed]
-    if max(shares) < _LARGE or float(np.mean(shares)) <= usual:
+    if max(shares) < _LARGE or not errors.unusual(shares):
         return SceneChange((), photos, why)
     share = 100 * float(np.mean(shares))
     why += f"; {share:.0f} % of the photos' pixels are not understood: do the photos show one and the same state?"
@@ -138,7 +138,7 @@ def _unexplained(scene: Told, settled: Settled) -> list[Mask]:
         left = pixels.dilate(pixels.erode(left, 1), 1) & left
         out.append(pixels.keep_components(left, max(12, _NOTABLE * left.size)))
     unclear, changed = (sum(int(m.sum()) for m in masks) for masks in (out, [c.mask for c in scene.changed]))
-    unusual = float(np.mean([m.mean() for m in out])) > scene.usual
+    unusual = scene.errors.unusual([float(m.mean()) for m in out])
     return out if unclear > _MUCH * changed and unusual else []
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtri
 
 from refield.estimate.look import Array, View
 from refield.estimate.memory import Memory
@@ -20,6 +21,7 @@ from refield.vision import pixels
 
 Mask = NDArray[Any]
 _CLASSES = 5
+_TRUE = 0.99  # of times that nothing changed, so many are not said to be unclear
 _ENOUGH = 3  # photos that tell more of the field's errors than those that it was fitted to
 
 
@@ -84,8 +86,19 @@ class Errors:
     """(C,) Lab units by the class of coverage, see `_coverage`: what is larger may be part of a change"""
     seeds: Array
     """(C,) a change is larger than this somewhere"""
-    usual: float = 0.0
-    """the largest part of one of those photos that would be taken for changed if it were new"""
+    by_chance: tuple[float, ...] = ()
+    """the part of each of some of those photos that would be taken for changed if it were new"""
+
+    def unusual(self, shares: Sequence[float]) -> bool:
+        """Whether new photos' changed parts are more than the field's errors make of as many photos without a change.
+
+        Where such parts are exponentially distributed, the quotient of two means is as F.
+        """
+        if not self.by_chance:
+            return True
+        mean = (sum(self.by_chance) + DetectConfig.smallest) / len(self.by_chance)
+        bound = float(fdtri(2 * len(shares), 2 * len(self.by_chance), _TRUE))
+        return float(np.mean(shares)) > bound * mean
 
 
 def blur_sigma(view: View, config: DetectConfig) -> float:
@@ -139,12 +152,12 @@ def errors(field_photos: Sequence[View], others: Sequence[View], memory: Memory,
     levels, seeds = (_by_coverage(known, of, q) for q in (config.noise_quantile, config.seed_quantile))
     levels, seeds = np.maximum(config.floor, levels), 1.3 * np.maximum(config.floor, seeds)
     shown = (*fitted, *unseen)
-    shares = [0.0]
+    shares = []
     for one in asked:
         others_than = Errors(tuple(s for s in shown if s is not one), memory, levels, seeds)
         (found,) = _marked([one.view], [one.difference], others_than, config)
         shares.append(float(found.mask.mean()))
-    return Errors(shown, memory, levels, seeds, max(shares))
+    return Errors(shown, memory, levels, seeds, tuple(shares))
 
 
 def _unchanged(view: View, config: DetectConfig) -> Changed:

@@ -34,6 +34,7 @@ from refield.scene.errors import InputError
 from refield.scene.planes import Plane, rough_planes
 
 OnStage = Callable[[str], None]
+_MUCH_NEW = 0.02  # of a photo's pixels, from which on it is said that no old photo saw what they show
 _OTHER_LIGHT = 2.0  # times brighter or darker, from which on a photo's light is spoken of
 
 
@@ -121,14 +122,15 @@ def estimate_change(
     say("detect")
     scene = replace(_detected(capture, field, frames, config, models), known=tuple(known))
     photos = scene.photos
+    beside = _light(photos) + _never_seen(scene.changed)
     if not any(c.mask.any() for c in scene.changed):
         why = "no pixel differs by more than the field's own errors on the old photos"
-        return SceneChange((), photos, why + _light(photos))
+        return SceneChange((), photos, why + beside)
     say("hull")
     region = hull.find_region(scene.changed, config.hull)
     if region is None:
-        answer = disagreeing(scene.changed, photos, scene.errors.usual)
-        return replace(answer, why=answer.why + _light(photos))
+        answer = disagreeing(scene.changed, photos, scene.errors)
+        return replace(answer, why=answer.why + beside)
     carved, free = _carved(scene, region)
     things, others = changed_parts(scene.changed, carved, free, config.hull.smallest, models.segmenter)
     olds = _were_there(scene, carved, things or others)
@@ -144,15 +146,18 @@ def estimate_change(
     if more:
         settled = associate.settle(ground, _whole([*olds, *more]), scene.changed)
     say("segment")
-    return concluded(Told(field, capture.train, scene.changed, photos, carved, scene.errors.usual), settled)
+    answer = concluded(Told(field, capture.train, scene.changed, photos, carved, scene.errors), settled)
+    return replace(answer, why=answer.why + _never_seen(scene.changed))
 
 
 def _detected(
     capture: Capture, field: Field, frames: Sequence[Frame], config: EstimateConfig, models: Models
 ) -> _Scene:
     views = [_placed(field, f, config) for f in frames]
-    survey = [look.view_of(field, f, config.max_pixels) for f in look.spread_out(capture.train, config.survey)]
-    others = [look.view_of(field, f, config.max_pixels) for f in look.spread_out(capture.held_out, config.survey)]
+    # half of them not fitted to: the field's errors elsewhere are theirs
+    left_out = look.spread_out(capture.held_out, config.survey // 2)
+    taught = look.spread_out(capture.train, config.survey - len(left_out))
+    survey, others = ([look.view_of(field, f, config.max_pixels) for f in some] for some in (taught, left_out))
     errors = detect.errors(survey, others, Memory.of(field, capture.train), config.detect)
     changed = detect.changes(views, errors, config.detect)
     shares = [float(c.mask.mean()) for c in changed]
@@ -194,6 +199,13 @@ def _light(photos: Sequence[PlacedPhoto]) -> str:
     """What is to be said of light that changed in whole photos."""
     other = [f"{p.name} is {p.why}" for p in photos if p.status == "used" and p.why]
     return f"; the light changed: {', '.join(other)}" if other else ""
+
+
+def _never_seen(changed: Sequence[Changed]) -> str:
+    """What is to be said of what no old photo saw."""
+    shares = [(c.view.frame.name, float(c.new.mean())) for c in changed]
+    much = [f"{100 * share:.0f} % of {name}" for name, share in shares if share >= _MUCH_NEW]
+    return f"; no old photo saw what is in {', '.join(much)}, so nothing is said of it" if much else ""
 
 
 def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
