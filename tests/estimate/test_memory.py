@@ -98,3 +98,19 @@ def test_errors_grow_where_fewer_photos_looked_and_never_shrink():
     assert levels[-1] == np.quantile(wrong, 0.9)
     few = detect._by_coverage(wrong[:9], np.zeros(9, int), 0.9)
     assert (few == few[-1]).all()
+
+
+def test_as_much_as_chance_makes_is_not_unusual():
+    """Of 400 times that nothing changed, parts exponentially distributed, hardly any is said to be unusual; ten times as
+    much nearly always is."""
+    rng = np.random.default_rng(0)
+    nobody = np.zeros(0)
+    counts = []
+    for factor in (1, 10):
+        told = 0
+        for _ in range(400):
+            known = detect.Errors((), None, nobody, nobody, tuple(rng.exponential(0.01, 6)))
+            told += known.unusual(factor * rng.exponential(0.01, 4))
+        counts.append(told)
+    assert counts[0] <= 12 and counts[1] >= 300
+    assert detect.Errors((), None, nobody, nobody).unusual([0.001])
