@@ -101,8 +101,7 @@ def test_errors_grow_where_fewer_photos_looked_and_never_shrink():
 
 
 def test_as_much_as_chance_makes_is_not_unusual():
-    """Of 400 times that nothing changed (exponentially distributed parts) hardly any is said to be unusual; ten times as
-    much nearly always is."""
+    """Of 400 times that nothing changed hardly any is said to be unusual; ten times as much nearly always is."""
     rng = np.random.default_rng(0)
     nobody = np.zeros(0)
     counts = []
