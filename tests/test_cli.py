@@ -255,6 +255,7 @@ def test_visits_are_listed_and_taken_back(place, monkeypatch, capsys):
     assert main(["visits", "work"]) == 0
     out = capsys.readouterr().out
     assert "moved from (0, 0, 0) by 0.5" in out and "added at" in out and "because" in out
+    assert main(["report", "work"]) == 0 and (place / "work/report.html").is_file()  # it tells of both visits
     assert main(["undo", "work"]) == 0 and contents(place / "work") == first
     assert main(["undo", "work"]) == 0 and contents(place / "work") == before
     assert "after visit 0" in capsys.readouterr().out

@@ -3,6 +3,7 @@
 import gzip
 import json
 import math
+import shutil
 import struct
 import sys
 from dataclasses import replace
@@ -14,10 +15,12 @@ import pytest
 import torch
 import trimesh
 
+from refield.artefacts import LOCK, locked
 from refield.cli import main
 from refield.export.gltf import ROOT, quaternion, upright
 from refield.export.recipe import ExportConfig, export
 from refield.field.render import render_camera
+from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.colmap import load_colmap
 from refield.scene.images import read_image
 from refield.scene.pose import exp, invert, transform
@@ -308,6 +311,8 @@ def test_before_any_visit(made, tmp_path, capsys):
         (["--points", "3"], "too few"),
         (["--out", "work/capture/out"], "belongs to the workspace"),
         (["--out", "data/transforms.json"], "is a file"),
+        (["--out", "work"], "is a workspace"),
+        (["--what"], "names nothing"),
     ],
 )
 def test_what_cannot_be_is_one_line(made, monkeypatch, capsys, argv, told):
@@ -347,6 +352,32 @@ def test_files_of_others_are_kept(made, tmp_path, capsys):
     assert {"changes.glb", "cameras/capture/transforms.json"} <= json.loads((tmp_path / "export.json").read_text())[
         "files"
     ].keys()
+
+
+def test_a_list_of_others_is_kept(made, tmp_path, capsys):
+    (tmp_path / "export.json").write_text('{"mine": 1}')
+    argv = ["export", str(made / "work"), "--out", str(tmp_path), "--what", "changes"]
+    assert main(argv) == 2
+    assert "export.json" in capsys.readouterr().err and (tmp_path / "export.json").read_text() == '{"mine": 1}'
+
+
+def test_a_lock_of_others_is_kept(made, tmp_path, capsys):
+    with locked(tmp_path):
+        assert main(["export", str(made / "work"), "--out", str(tmp_path), "--what", "changes"]) == 2
+        assert "being written" in capsys.readouterr().err and (tmp_path / LOCK).exists()
+
+
+def test_after_a_visit_that_found_nothing(made, tmp_path):
+    """Such a visit keeps no photos."""
+    shutil.copytree(made / "work", tmp_path / "work")
+    workspace = Workspace.open(tmp_path / "work")
+    frames = workspace.capture().frames[:2]
+    nothing = SceneChange(photos=tuple(PlacedPhoto(f.name, "used", frame=f) for f in frames), why="nothing changed")
+    with workspace.writing(), workspace.new_visit() as folder:
+        workspace.keep_change(folder, nothing)
+    out = tmp_path / "out"
+    assert main(["export", str(tmp_path / "work"), "--out", str(out), "--what", "cameras", "changes"]) == 0
+    assert (out / "cameras/visit_1").is_dir() and not (out / "cameras/visit_2").exists()
 
 
 @pytest.mark.parametrize("there", [False, True])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -38,18 +39,19 @@ class Export:
 def run(options: Export) -> Answer:
     clock = Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     workspace = Workspace.open(options.work)
-    files = export(
-        workspace,
-        options.out,
-        options.how,
-        visit=options.visit,
-        overwrite=options.overwrite,
-        on_stage=clock.stage,
-        counting=clock.counting,
-    )
+    with clock.counters() as counters:
+        files = export(
+            workspace,
+            options.out,
+            options.how,
+            visit=options.visit,
+            overwrite=options.overwrite,
+            on_stage=clock.stage,
+            counting=lambda what: nullcontext(counters(what)),
+        )
     clock.stop()
-    document = {"workspace": options.work, "out": options.out, "files": files}
-    document |= {"seconds_per_stage": clock.seconds, "warnings": clock.warnings}
+    document = {"workspace": options.work, "visit": workspace.chosen_visit(options.visit), "out": options.out}
+    document |= {"files": files, "seconds_per_stage": clock.seconds, "warnings": clock.warnings}
     words = f"{len(files)} files in {options.out}, {clock.total:.1f} s"
     return Answer(document, [_table(options.out, files), words])
 

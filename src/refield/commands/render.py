@@ -122,6 +122,7 @@ def run(options: Render) -> Answer:
             write_scale(places.depths[0].parent / SCALE, scale, workspace.world())
     clock.stop()
     document = {"workspace": options.work, "visits": visits, "out": options.out, "pictures": places.pictures}
+    document |= {"count": len(frames)}
     document |= {"depths": places.depths, "depth_step": scale, "opacities": places.opacities}
     document |= {"seconds_per_stage": clock.seconds, "warnings": clock.warnings}
     return Answer(document, list(_told(options, views, places, frames, scale, beyond)))

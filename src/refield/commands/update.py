@@ -84,7 +84,7 @@ def facts_of(work: Path, visit: Visit) -> dict[str, Any]:
     """A visit as ``refield visits --json`` tells it, its photos one by one, and the numbers of its evaluation."""
     return {
         "workspace": work,
-        **visit_facts(Workspace(work), int(visit.folder.name)),
+        **visit_facts(Workspace(work), visit.number),
         "photos": [{"name": p.name, "status": p.status, "why": p.why} for p in visit.change.photos],
         "evaluation": None if visit.evaluation is None else visit.evaluation.to_dict(),
     }

@@ -204,7 +204,7 @@ def _blocked(field: Field, poses: Sequence[Tensor], clear: float) -> int:
 
 def _along(path: Path, capture: Capture, pace: Pace, warn: Warn) -> Views:
     """Through the keyframes of a file, or through the photos' places."""
-    if path == PHOTOS and not path.exists():
+    if path == PHOTOS:
         count, fps = pace.of_path(_SECONDS["tour"])
         camera = typical_camera(capture.frames)
         keyframes = [replace(frame, camera=camera) for frame in tour(capture.frames)]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from refield.artefacts import LOCK, locked, need_space, part_folder, sync, sync_folder, writable
 from refield.export.cameras import write_cameras
@@ -25,11 +25,12 @@ from refield.scene.errors import InputError
 from refield.scene.files import read_json, write_json
 from refield.scene.ply import write_surface
 from refield.scene.world import World
-from refield.workspace import Workspace, refuse_inside
+from refield.workspace import MARKER, Workspace, refuse_inside
 
 What = Literal["points", "mesh", "splats", "cameras", "changes"]
 EVERYTHING: tuple[What, ...] = ("points", "mesh", "splats", "cameras", "changes")
 MANIFEST = "export.json"
+_FORMAT = "refield export"
 _NEEDED = {
     "mesh": {"skimage": "scikit-image", "fast_simplification": "fast-simplification"},
     "splats": {"gsply": "gsply"},
@@ -97,6 +98,10 @@ def export(
     refuse_inside(out)
     if out.exists() and not out.is_dir():
         raise InputError(out, "is a file, not a folder", "choose another output folder")
+    if (out / MARKER).exists():
+        raise InputError(out, "is a workspace", "choose another output folder")
+    if not how.what:
+        raise InputError("--what", "names nothing", f"give some of {', '.join(get_args(What))}, or leave it out")
     if how.points < _FEWEST or how.faces < _FEWEST:
         raise InputError("--points, --faces", f"{min(how.points, how.faces)} is too few", f"give {_FEWEST} or more")
     changes = [workspace.change(n, masks=False) for n in range(1, visit + 1)]
@@ -107,11 +112,14 @@ def export(
     with writable(out):
         out.mkdir(parents=True, exist_ok=True)
     try:
-        with locked(out), part_folder(out) as part:
-            _write_all(scene, part, capture, changes, on_stage, counting or _uncounted)
-            return _put(part, out, visit, overwrite=overwrite, facts=_facts(scene))
+        with locked(out):
+            try:
+                with part_folder(out) as part:
+                    _write_all(scene, part, capture, changes, on_stage, counting or _uncounted)
+                    return _put(part, out, visit, overwrite=overwrite, facts=_facts(scene))
+            finally:
+                (out / LOCK).unlink(missing_ok=True)
     finally:
-        (out / LOCK).unlink(missing_ok=True)
         if made and not (out / MANIFEST).exists():
             with contextlib.suppress(OSError):
                 out.rmdir()
@@ -141,7 +149,7 @@ def _write_all(
     if "cameras" in what:
         on_stage("cameras")
         sets = {"capture": capture}
-        sets |= {f"visit_{n}": Capture(c.frames, held_out_every=0) for n, c in enumerate(changes, start=1) if c.frames}
+        sets |= {f"visit_{n}": Capture(c.frames, held_out_every=0) for n, c in enumerate(changes, start=1) if c.objects}
         need_space(part, sum(f.path.stat().st_size for s in sets.values() for f in s.frames))
         for name, photos in sets.items():
             write_cameras(part / "cameras" / name, photos, scene.world)
@@ -235,6 +243,8 @@ def _put(part: Path, out: Path, visit: int, *, overwrite: bool, facts: dict[str,
     names = sorted(p.relative_to(part).as_posix() for p in part.rglob("*") if p.is_file())
     known = _known(out)
     foreign = [name for name in names if (out / name).exists() and name not in known]
+    if (out / MANIFEST).exists() and not _is_manifest(out / MANIFEST):
+        foreign.append(MANIFEST)
     if foreign and not overwrite:
         what = f"holds files that refield export did not write ({', '.join(foreign[:3])})"
         raise InputError(out, what, "choose another output folder, or pass --overwrite")
@@ -242,7 +252,7 @@ def _put(part: Path, out: Path, visit: int, *, overwrite: bool, facts: dict[str,
     listed = {name: facts for name, facts in known.items() if (out / name).is_file()}
     listed |= {name: {"visit": visit, "bytes": (part / name).stat().st_size} for name in names}
     # first, so that what is there of an export that was stopped now is known as ours
-    manifest = {"format": "refield export", "version": 1, **facts, "files": dict(sorted(listed.items()))}
+    manifest = {"format": _FORMAT, "version": 1, **facts, "files": dict(sorted(listed.items()))}
     with writable(out):
         write_json(out / MANIFEST, manifest)
         for name in names:
@@ -254,10 +264,18 @@ def _put(part: Path, out: Path, visit: int, *, overwrite: bool, facts: dict[str,
 
 def _known(out: Path) -> dict[str, Any]:
     """The files that earlier exports wrote into a folder."""
-    if not (out / MANIFEST).is_file():
+    if not _is_manifest(out / MANIFEST):
         return {}
     files = read_json(out / MANIFEST).get("files")
     return files if isinstance(files, dict) else {}
+
+
+def _is_manifest(path: Path) -> bool:
+    """Whether an export wrote this file."""
+    try:
+        return read_json(path).get("format") == _FORMAT
+    except InputError:
+        return False
 
 
 class _Uncounted(AbstractContextManager[Progress]):

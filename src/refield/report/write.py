@@ -30,12 +30,12 @@ def link_next(page: Path, number: int | None) -> None:
     """Let a visit's page link to the next visit, or, for None, no longer. A page that is missing, cannot be
     written or has no place for it stays as it is: the visit itself is whole without."""
     begin, end = (mark.encode() for mark in NEXT)
-    text = page.read_bytes() if page.is_file() else b""
-    before, found, rest = text.partition(begin)
-    _, closed, after = rest.partition(end)
-    if found and closed:
-        link = b"" if number is None else visit_link(number, "Next").encode()
-        with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError):
+        text = page.read_bytes() if page.is_file() else b""
+        before, found, rest = text.partition(begin)
+        _, closed, after = rest.partition(end)
+        if found and closed:
+            link = b"" if number is None else visit_link(number, "Next").encode()
             write_bytes(page, before + begin + link + end + after)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,7 +18,7 @@ from refield.field.render import render_camera
 from refield.history import known_objects, retouched, state
 from refield.photos.sources import find_sources
 from refield.photos.taken import PhotoConfig
-from refield.report import PAGE, link_next, write_contact_sheet, write_report
+from refield.report import PAGE, is_our_page, link_next, write_contact_sheet, write_report
 from refield.scene.capture import Capture, Frame, check_frames
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
@@ -129,6 +130,10 @@ def take_back(workspace: Workspace) -> int:
             raise InputError(workspace.path, what, f"make one with: refield update {workspace.path} PHOTOS")
         workspace.drop_last_visit()
         link_next(workspace.visit(number - 1) / PAGE, None)
+        history = workspace.path / PAGE  # it would tell of the visit, and link to it
+        if is_our_page(history):
+            with contextlib.suppress(OSError):
+                history.unlink()
     return number
 
 
