@@ -154,6 +154,8 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
     places = [(olds[k], still) for k in kept] + [(olds[k], c.new_from_old) for k, c in moved.items()]
     arrived = [p for p in arrived if not any(_rim_of(ground, p, old, place) for old, place in places)]
     arrived = [consistent(ground.hull.lattice, p, [(v.view, v.open) for v in views]) for p in arrived]
+    # what its colours leave of it must be as believable as the whole was
+    arrived = [p for p in arrived if fresh(views, ground.hull.lattice, p) >= ground.believe.arrived]
     moved = {k: c for k, c in moved.items() if _noticeable(olds[k], c, ground.believe.still)}
     return Settled(moved, removed, tuple(arrived), tuple(views), tuple(olds))
 
@@ -296,6 +298,13 @@ def _only_light(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
         alike += int((here & even_and_grey(log_ratio(p.view, p.rgb, ground.detect), ground.detect)).sum())
         shown += int(here.sum())
     return alike > 0.5 * shown
+
+
+def fresh(past: Sequence[Past], lattice: Lattice, part: Voxels) -> float:
+    """Part of a newcomer's pixels that nothing else explains, the median over photos that show any."""
+    shadows = [(shadow_of(p.view, lattice, part), p.open) for p in past]
+    shares = [float((here & left).sum() / here.sum()) for here, left in shadows if here.any()]
+    return float(np.median(shares)) if shares else 0.0
 
 
 def shadow_of(view: View, lattice: Lattice, voxels: Voxels) -> Mask:

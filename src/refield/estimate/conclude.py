@@ -12,7 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from refield.estimate import past, segment
-from refield.estimate.associate import Settled, shadow_of
+from refield.estimate.associate import Settled, fresh, shadow_of
 from refield.estimate.detect import Changed, Errors, Mask
 from refield.estimate.hull import Hull
 from refield.estimate.lattice import Lattice, Voxels
@@ -56,7 +56,7 @@ def concluded(scene: Told, settled: Settled) -> SceneChange:
         masks = _masks_of(frames, olds[k])
         changes.append(ObjectChange("removed", olds[k].shape, masks=masks, confidence=share, note=note))
     for part in settled.arrived:
-        grid, share = _newcomer(lattice, part), _fresh(settled, lattice, part)
+        grid, share = _newcomer(lattice, part), fresh(settled.views, lattice, part)
         note = f"it hides what was there in {100 * share:.0f} % of its pixels, and nothing that left looks like it"
         changes.append(
             ObjectChange("added", grid, masks_in=segment.masks_in(frames, grid), confidence=share, note=note)
@@ -115,13 +115,6 @@ def _by(o: ObjectChange) -> str:
         return ""
     turn = float(angle_between(o.new_from_old, torch.eye(4, dtype=torch.float64)))
     return f" by {float(o.shift.norm()):.4g} and turned by {turn:.0f} degrees"
-
-
-def _fresh(settled: Settled, lattice: Lattice, part: Voxels) -> float:
-    """Part of a newcomer's pixels that nothing else explains, the median over photos that show any."""
-    shadows = [(shadow_of(p.view, lattice, part), p.open) for p in settled.views]
-    shares = [float((here & left).sum() / here.sum()) for here, left in shadows if here.any()]
-    return float(np.median(shares)) if shares else 0.0
 
 
 def _unexplained(scene: Told, settled: Settled) -> list[Mask]:

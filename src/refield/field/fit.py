@@ -103,6 +103,7 @@ class _StuckError(RuntimeError):
 # teach did (in dB) in four foamed fits of one world, 0.27 to 0.67 in six sound ones of three real scenes, 0.7 and more
 # in nine others.
 _TRIES, _FIRST_STEP, _SECOND_STEP = 5, 100, 500
+_FIRST = 0.1  # of its time, in which only steps tell how far it is
 _LATE = 0.3  # of its time; so late a fit does not begin anew
 _BY_HEART = 0.1
 
@@ -361,7 +362,7 @@ class _Fit:
         if self.on_progress:
             seconds = time.perf_counter() - self.began
             counted = seconds - self.compiling.seconds
-            left = counted * (1 / max(self._progress(step), 1e-6) - 1)
+            left = seconds_left(self.config, step, counted)
             self.on_progress(
                 FitProgress(
                     step,
@@ -377,9 +378,19 @@ class _Fit:
 
 
 def progress_of(config: FitConfig, step: int, began: float) -> float:
-    """How far a fit is, 1 at its end: by its steps or by its seconds since ``began``, whichever is further on."""
-    by_time = (time.perf_counter() - began) / config.max_seconds if config.max_seconds else 0.0
-    return max(step / config.steps, by_time)
+    """How far a fit is, 1 at its end: by its steps or by its seconds since ``began``, whichever is further on.
+
+    The first seconds do not count, so that a fit which ends long before its time is the same on any machine: the first
+    steps take the longest.
+    """
+    part = (time.perf_counter() - began) / config.max_seconds if config.max_seconds else 0.0
+    return max(step / config.steps, (part - _FIRST) / (1 - _FIRST))
+
+
+def seconds_left(config: FitConfig, step: int, seconds: float) -> float:
+    """Until a fit ends that has done so many steps in so many seconds, if it goes on like that."""
+    by_steps = seconds * (config.steps / max(step, 1) - 1)
+    return max(min(by_steps, (config.max_seconds or math.inf) - seconds), 0.0)
 
 
 def at_plateau(looks: list[float], config: FitConfig) -> bool:

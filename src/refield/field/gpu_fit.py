@@ -19,6 +19,7 @@ from refield.field.fit import (
     at_plateau,
     progress_of,
     rate_factor,
+    seconds_left,
 )
 from refield.field.graphed import Descent, DevicePixels, GraphedStep
 from refield.field.kernels.reference import Aim
@@ -186,7 +187,7 @@ class _GpuFit:
         self.model.train()
         if self.on_progress:
             seconds = time.perf_counter() - self.began
-            left = max(seconds * (1 / max(progress_of(self.config, step, self.began), 1e-6) - 1), 0.0)
+            left = seconds_left(self.config, step, seconds)
             speed = self.rays_done / seconds
             self.on_progress(FitProgress(step, self.config.steps, psnr, speed, samples_per_ray, seconds, left))
         return psnr
