@@ -68,8 +68,7 @@ def test_what_no_photo_saw_is_new_and_no_change(tmp_path, poses):
     behind = [camera_at(angle, 30) for angle in (170, 180, 190)]
     views = views_of(OLD, tmp_path / "new", behind)
     memory, config = Memory.of(OLD, capture.train), DetectConfig()
-    fitted, others = ([view_of(OLD, f, 10_000) for f in some] for some in (capture.train, capture.held_out))
-    errors = detect.errors(fitted, others, memory, config)
+    errors = detect.errors([view_of(OLD, f, 10_000) for f in capture.frames], memory, config)
     for view in views:
         on_crate = CRATE.inside(torch.nan_to_num(torch.from_numpy(view.surface + 0.02 * view.directions))).numpy()
         side = on_crate & (view.surface[..., 2] < 0.14)

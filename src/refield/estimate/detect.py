@@ -22,7 +22,6 @@ from refield.vision import pixels
 Mask = NDArray[Any]
 _CLASSES = 5
 _TRUE = 0.99  # of times that nothing changed, so many are not said to be unclear
-_ENOUGH = 3  # photos that tell more of the field's errors than those that it was fitted to
 
 
 @dataclass(frozen=True)
@@ -138,24 +137,17 @@ def noise_at(view: View, survey: Sequence[Changed]) -> Array:
     return mean.reshape(view.shape)
 
 
-def errors(field_photos: Sequence[View], others: Sequence[View], memory: Memory, config: DetectConfig) -> Errors:
-    """The field's own errors.
-
-    Args:
-        field_photos: old photos that it was fitted to; it is better there than elsewhere.
-        others: old photos that it was not. If there are too few, the former stand in.
-    """
-    fitted, unseen = ([_unchanged(v, config) for v in views] for views in (field_photos, others))
-    asked = unseen if len(unseen) >= _ENOUGH else [*fitted, *unseen]
-    of = np.concatenate([_coverage(memory.times_seen(s.view)).ravel() for s in asked])
-    known = np.concatenate([s.difference.ravel() for s in asked])
+def errors(photos: Sequence[View], memory: Memory, config: DetectConfig) -> Errors:
+    """The field's own errors, in ``photos`` of the old state."""
+    shown = tuple(_unchanged(v, config) for v in photos)
+    of = np.concatenate([_coverage(memory.times_seen(s.view)).ravel() for s in shown])
+    known = np.concatenate([s.difference.ravel() for s in shown])
     levels, seeds = (_by_coverage(known, of, q) for q in (config.noise_quantile, config.seed_quantile))
     levels, seeds = np.maximum(config.floor, levels), 1.3 * np.maximum(config.floor, seeds)
-    shown = (*fitted, *unseen)
     shares = []
-    for one in asked:
-        others_than = Errors(tuple(s for s in shown if s is not one), memory, levels, seeds)
-        (found,) = _marked([one.view], [one.difference], others_than, config)
+    for one in shown:
+        others = Errors(tuple(s for s in shown if s is not one), memory, levels, seeds)
+        (found,) = _marked([one.view], [one.difference], others, config)
         shares.append(float(found.mask.mean()))
     return Errors(shown, memory, levels, seeds, tuple(shares))
 

@@ -154,11 +154,8 @@ def _detected(
     capture: Capture, field: Field, frames: Sequence[Frame], config: EstimateConfig, models: Models
 ) -> _Scene:
     views = [_placed(field, f, config) for f in frames]
-    # half of them not fitted to: the field's errors elsewhere are theirs
-    left_out = look.spread_out(capture.held_out, config.survey // 2)
-    taught = look.spread_out(capture.train, config.survey - len(left_out))
-    survey, others = ([look.view_of(field, f, config.max_pixels) for f in some] for some in (taught, left_out))
-    errors = detect.errors(survey, others, Memory.of(field, capture.train), config.detect)
+    survey = [look.view_of(field, f, config.max_pixels) for f in look.spread_out(capture.frames, config.survey)]
+    errors = detect.errors(survey, Memory.of(field, capture.train), config.detect)
     changed = detect.changes(views, errors, config.detect)
     shares = [float(c.mask.mean()) for c in changed]
     photos = tuple(_verdict(c.view, share, config.most_changed) for c, share in zip(changed, shares))
