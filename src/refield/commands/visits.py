@@ -13,7 +13,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from refield.commands.answer import Answer
 from refield.commands.options import PLAIN, Output
 from refield.history import changed_visits
-from refield.report import object_shift, turn
+from refield.report import PAGE, object_shift
 from refield.scene.change import ObjectChange, SceneChange
 from refield.scene.change_files import NAME as CHANGE
 from refield.scene.files import read_json
@@ -54,7 +54,7 @@ def visit_facts(workspace: Workspace, number: int) -> dict[str, Any]:
         "changed": bool(changed_visits(workspace, number)[-1:] == [number]),
         "not_understood": unclear,
         "why": _why(change, unclear),
-        "report": str(folder / "report.html"),
+        "report": str(folder / PAGE),
     }
 
 
@@ -64,7 +64,7 @@ def _told(o: ObjectChange) -> dict[str, Any]:
         "kind": o.kind,
         "at": [round(v, 4) for v in o.centre.tolist()],
         "moved_by": None if shift is None else math.hypot(*shift),
-        "turned_by_deg": None if o.new_from_old is None else turn(o.new_from_old)[0],
+        "turned_by_deg": o.turn_deg,
         "confidence": o.confidence,
         "note": o.note,
     }

@@ -96,6 +96,7 @@ class Ground:
     """what holds things up"""
     survey: Sequence[View]
     memory: Memory
+    """what old photos saw"""
     photographed: Sequence[Frame]
     """old photos that show the old state as it was"""
     detect: DetectConfig

@@ -23,7 +23,7 @@ from refield.estimate.pose_change import PoseChange
 from refield.field.radiance import Field
 from refield.scene.capture import Frame
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
-from refield.scene.pose import adjoint, angle_between, rigid, transform
+from refield.scene.pose import adjoint, rigid, transform
 from refield.vision import pixels
 
 _NOTABLE = 0.002  # of a photo's pixels; smaller spots that nothing explains are not spoken of
@@ -111,10 +111,9 @@ def _why_moved(change: PoseChange) -> str:
 
 
 def _by(o: ObjectChange) -> str:
-    if o.new_from_old is None or o.shift is None:
+    if o.shift is None:
         return ""
-    turn = float(angle_between(o.new_from_old, torch.eye(4, dtype=torch.float64)))
-    return f" by {float(o.shift.norm()):.4g} and turned by {turn:.0f} degrees"
+    return f" by {float(o.shift.norm()):.4g} and turned by {o.turn_deg:.0f} degrees"
 
 
 def _unexplained(scene: Told, settled: Settled) -> list[Mask]:

@@ -18,7 +18,7 @@ from torch import Tensor
 from refield.export.gltf import Glb
 from refield.scene.change import ObjectChange, SceneChange
 from refield.scene.files import write_bytes, write_json
-from refield.scene.pose import rigid, rotation_log
+from refield.scene.pose import rigid
 from refield.scene.world import World
 
 _BEFORE, _NOW = (0.9, 0.25, 0.05, 0.35), (0.05, 0.6, 0.2, 0.35)  # linear, with opacity
@@ -86,7 +86,6 @@ def name_of(visit: int, index: int) -> str:
 def _object(o: ObjectChange, world: World, visit: int, index: int) -> dict[str, Any]:
     box = box_of(o, world)
     old, new = _places(o, box)
-    turned = None if o.new_from_old is None else float(torch.rad2deg(rotation_log(o.new_from_old[:3, :3]).norm()))
     return {
         "id": name_of(visit, index),
         "kind": o.kind,
@@ -100,7 +99,7 @@ def _object(o: ObjectChange, world: World, visit: int, index: int) -> dict[str, 
         "covariance": _rows(o.covariance),
         "centre": o.centre.tolist(),
         "shift": _rows(o.shift),
-        "turned_deg": turned,
+        "turned_deg": o.turn_deg,
     }
 
 

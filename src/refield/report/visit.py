@@ -185,7 +185,7 @@ def _object_dict(o: ObjectChange, world: World | None) -> dict[str, Any]:
         "shift": shift,
         "shift_of_scene": part,
         "shift_metres": metres,
-        "angle_deg": None if o.new_from_old is None else turn(o.new_from_old)[0],
+        "angle_deg": o.turn_deg,
         "axis": None if o.new_from_old is None else turn(o.new_from_old)[1],
         "std_shift": None if sure is None else finite(sure[0]),
         "std_angle_deg": None if sure is None else finite(sure[1]),

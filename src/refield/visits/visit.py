@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from refield.evaluate import Report
-from refield.report import summary
+from refield.report import PAGE, summary
 from refield.scene.change import SceneChange
 from refield.scene.files import read_json
 from refield.workspace import Workspace
@@ -33,7 +33,7 @@ class Visit:
     @property
     def html(self) -> Path:
         """The report's page."""
-        return self.folder / "report.html"
+        return self.folder / PAGE
 
     @property
     def sheet(self) -> Path:
