@@ -180,6 +180,11 @@ def test_marks_come_and_go(opened: Any) -> None:
     assert not page.locator(".photo .no").first.is_visible()
 
 
+def wait_until_put_back(page: Any) -> None:
+    """A dialog says that it is closed in a task of its own, after the key or the click has returned."""
+    page.locator("dialog figure").wait_for(state="detached")
+
+
 def test_pictures_are_enlarged_by_keyboard(opened: Any) -> None:
     page = opened("visit").page
     small = page.locator(".pair .stage").first.bounding_box()["width"]
@@ -196,6 +201,7 @@ def test_pictures_are_enlarged_by_keyboard(opened: Any) -> None:
     page.keyboard.press("End")  # the slider is there too
     assert main_channel(colour(page, "dialog .pair .stage", 0.75, 0.7)) == "red"
     page.keyboard.press("Escape")
+    wait_until_put_back(page)
     assert page.locator("dialog[open]").count() == 0
     assert page.evaluate("document.activeElement.getAttribute('aria-label')") == name
     assert page.locator("main .pair .stage").first.bounding_box()["width"] == small
@@ -207,6 +213,7 @@ def test_a_click_on_a_photo_enlarges_it(opened: Any) -> None:
     assert it.page.locator("dialog[open] figure.photo").count() == 1
     assert it.page.evaluate("document.documentElement.scrollWidth") == 400
     it.page.locator(".close").click()
+    wait_until_put_back(it.page)
     assert it.page.locator("main figure.photo").count() == 3 and it.said == []
 
 
