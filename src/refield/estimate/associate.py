@@ -296,7 +296,7 @@ def _only_light(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
     alike, shown = 0, 0
     for p in past:
         here = shadow_of(p.view, ground.hull.lattice, part) & p.open
-        alike += int((here & even_and_grey(log_ratio(p.view, p.rgb, ground.detect), ground.detect)).sum())
+        alike += int((here & even_and_grey(log_ratio(p.view, p.rgb, ground.detect))).sum())
         shown += int(here.sum())
     return alike > 0.5 * shown
 
