@@ -23,7 +23,7 @@ DARK = 0.03
 LARGEST = 5.0
 """times that light makes a surface brighter or darker, at most"""
 _GREY = 0.10  # log units by which light changes one channel more than another, however bright it is
-_TINT = 0.15  # and of how much brighter or darker it makes them
+_TINT = 0.5  # and of how much brighter or darker it makes them: half of what leaves one channel as it was
 _AGREE = 0.12  # log units between two views' ratios of the same surface point
 _SAME_PLACE = 0.02  # of the distance
 
