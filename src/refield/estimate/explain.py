@@ -78,7 +78,7 @@ def explained_before(pictures: Sequence[tuple[Array, Array, NDArray[np.bool_]]],
 
 def _relit(p: Compared, sigma: float) -> Array:
     """The composite with each side's smooth light taken from the photo: what turned is lit anew."""
-    seen, shown = to_linear(p.photo), to_linear(p.composite)
+    seen, shown = to_linear(p.photo), to_linear(np.maximum(p.composite, 0))
     ratio = np.zeros_like(shown)
     for side in range(int(p.sides.max(initial=-1)) + 1):
         here = p.sides == side
