@@ -15,6 +15,7 @@ import pytest
 
 import refield
 from refield.cli import COMMANDS
+from tests.reach import reached
 
 ROOT = Path(__file__).parent.parent
 SOURCE = ROOT / "src" / "refield"
@@ -58,6 +59,48 @@ def test_every_equation_of_the_paper_has_its_place() -> None:
                 places[n] = bool(REFERENCE.search(row))
     assert sorted(places) == list(range(1, 17))
     assert all(places.values()), [n for n, there in places.items() if not there]
+
+
+NOT_RUN = "not run by the commands"
+
+
+def rows_of_the_method() -> list[str]:
+    rows = [r for r in (ROOT / "docs/method.md").read_text(encoding="utf-8").splitlines() if REFERENCE.search(r)]
+    return [r for r in rows if r.startswith("|")]
+
+
+def test_every_row_of_the_method_says_how_it_differs() -> None:
+    assert len(rows_of_the_method()) > 70
+    assert not [row for row in rows_of_the_method() if not row.rstrip().removesuffix("|").rpartition("|")[2].strip()]
+
+
+def test_what_the_method_names_is_run_by_someone() -> None:
+    """Each function follows from a command or a public name; or its row says that it does not."""
+    for row in rows_of_the_method():
+        named = {
+            (file.removesuffix(".py").replace("/", ".").removesuffix(".__init__"), n)
+            for file, n in REFERENCE.findall(row)
+        }
+        if NOT_RUN in row:
+            assert not named & reached(), row
+        else:
+            assert named <= reached(), f"{sorted(named - reached())} in: {row}"
+
+
+def test_what_nobody_runs_is_found_to_be_so() -> None:
+    run = reached()
+    assert ("update.train", "update_field") in run  # a public name
+    assert ("estimate.register", "register") in run  # called from far away
+    assert ("update.composite", "UpdatedField._route") in run  # a method, of something built elsewhere
+    assert ("field.kernels.cpu.step", "train_step") in run  # a twin, chosen by device
+    assert ("commands.undo", "run") in run
+    tests_alone = {
+        ("field.warp", "two_way"),
+        ("synthetic.oracles", "AnalyticField"),
+        ("scene.similarity", "similarity"),
+    }
+    benchmarks = {("baselines.retrain", "retrain"), ("baselines.inpaint", "Lama")}
+    assert not run & (tests_alone | benchmarks)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
