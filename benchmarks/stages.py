@@ -29,6 +29,7 @@ from torch import Tensor
 from refield.estimate import associate, recipe
 from refield.estimate.detect import Changed
 from refield.estimate.hull import Hull
+from refield.estimate.lattice import Voxels
 from refield.estimate.pose_change import PoseChange
 from refield.estimate.register import Candidate
 from refield.field.radiance import Field
@@ -61,7 +62,8 @@ class Stages:
     after: Field
     change: SceneChange
     changed: Sequence[Changed]
-    hull: Hull
+    carved: tuple[Hull, Voxels]
+    """and the voxels in front of what holds things up"""
     candidates: Sequence[Candidate]
     refined: PoseChange
 
@@ -84,8 +86,8 @@ def look(work: Path) -> Stages:
     workspace = Workspace.open(work)
     capture, before = workspace.capture(), state(workspace, 0)
     frames = load_new_photos(workspace.visit(1) / "photos", capture)
-    results: dict[str, list[Any]] = {name: [] for name in ("set_light_aside", "carve", "register", "refine")}
-    homes = (recipe.light, recipe.hull, associate, associate)
+    results: dict[str, list[Any]] = {name: [] for name in ("set_light_aside", "_carved", "register", "refine")}
+    homes = (recipe.light, recipe, associate, associate)
     with ExitStack() as stack:
         for module, (name, into) in zip(homes, results.items()):
             stack.enter_context(kept(module, name, into))
@@ -123,20 +125,17 @@ def heat(values: NDArray[Any], most: float) -> Image.Image:
     return photo(np.round(low + (high - low) * (2 * t - (t >= 0.5))).astype(np.uint8))
 
 
-def voxels(under: Image.Image, seen: Changed, parts: Sequence[tuple[NDArray[Any], tuple[int, ...]]]) -> Image.Image:
-    """Voxels' centres (N, 3) of each part as squares, the nearer over the further and the brighter."""
+def voxels(seen: Changed, centres: NDArray[Any], colour: tuple[int, ...]) -> Image.Image:
+    """Voxels' centres (N, 3) as squares over a pale photo, the nearer over the further and the brighter."""
     h, w = seen.view.shape
-    drawn = []
-    for centres, colour in parts:
-        uv, distance, inside = seen.view.project(centres.reshape(-1, 3))
-        scale = [SIDE / w, SIDE / h]
-        drawn += [(d, *(p * scale), colour) for p, d in zip(uv[inside], distance[inside])]
-    out = under.copy()
+    uv, distance, inside = seen.view.project(centres)
+    order = np.argsort(-distance[inside])
+    at, far = (uv[inside] * [SIDE / w, SIDE / h])[order], distance[inside][order]
+    shades = 1.15 - 0.65 * (far - far[-1]) / max(float(far[0] - far[-1]), 1e-6)
+    out = photo(0.35 * seen.view.photo + 0.65)
     draw = ImageDraw.Draw(out)
-    near, far = min(d for d, *_ in drawn), max(d for d, *_ in drawn)
-    for d, u, v, colour in sorted(drawn, reverse=True):
-        shade = 1.15 - 0.55 * (d - near) / max(far - near, 1e-6)
-        draw.rectangle((u - 1.6, v - 1.6, u + 1.6, v + 1.6), fill=tuple(min(int(c * shade), 255) for c in colour))
+    for (u, v), shade in zip(at, shades):
+        draw.rectangle((u - 1.2, v - 1.2, u + 1.2, v + 1.2), fill=tuple(min(int(c * shade), 255) for c in colour))
     return out
 
 
@@ -176,11 +175,14 @@ def detected(s: Stages) -> list[Tile]:
 
 
 def carved(s: Stages) -> list[Tile]:
-    centres, held = s.hull.lattice.centres, s.hull.hull
-    parts = [(centres[held & s.hull.solid], OUT_COLOUR), (centres[held & ~s.hull.solid], IN_COLOUR)]
+    hull, free = s.carved
+    held, centres = hull.hull & free, hull.lattice.centres
+    was, now = centres[held & hull.solid], centres[held & ~hull.solid]
+    first, other = s.changed[0], s.changed[2]
     return [
-        (f"the change in space, from photo {i + 1}", voxels(photo(0.35 * c.view.photo + 0.65), c, parts))
-        for i, c in enumerate(s.changed[:3])
+        ("where something was", voxels(first, was, OUT_COLOUR)),
+        ("where something may be now", voxels(first, now, IN_COLOUR)),
+        ("the same, from the third photo", voxels(other, now, IN_COLOUR)),
     ]
 
 
@@ -193,14 +195,18 @@ def moved(s: Stages) -> ObjectChange:
 
 def posed(s: Stages) -> list[Tile]:
     thing, frame = moved(s), s.changed[0].view.frame
-    taken, (start, *_) = frame_image(frame), s.candidates
-    tiles = [("where it was", marked(photo(taken), silhouette((thing.grid,), frame), OUT_COLOUR, 0.2))]
-    for said, pose, colour in (
-        ("found by trying turns and places", start.new_from_old, START),
-        ("refined through the field", s.refined.new_from_old, IN_COLOUR),
-    ):
-        tiles.append((said, marked(photo(taken), silhouette((thing.grid.moved(pose),), frame), colour, 0.2)))
-    return tiles
+    taken = photo(frame_image(frame))
+    tried = taken
+    for candidate in reversed(s.candidates):
+        tried = marked(tried, silhouette((thing.grid.moved(candidate.new_from_old),), frame), START, 0.0)
+    return [
+        ("where it was", marked(taken, silhouette((thing.grid,), frame), OUT_COLOUR, 0.2)),
+        (f"the {len(s.candidates)} best of the poses tried", tried),
+        (
+            "refined through the field",
+            marked(taken, silhouette((thing.grid.moved(s.refined.new_from_old),), frame), IN_COLOUR, 0.2),
+        ),
+    ]
 
 
 def segmented(s: Stages) -> list[Tile]:
