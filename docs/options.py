@@ -35,7 +35,7 @@ class Option:
     """as it is typed, with what it takes"""
     told: str
     default: str
-    """or that it is required; empty where neither is said"""
+    """in Markdown; or that it is required; empty where neither is said"""
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,9 @@ def _box(title: str, lines: list[str]) -> Box:
 
 def _option(asked: str, told: str) -> Option:
     found = _DEFAULT.search(told)
-    default = "" if found is None else found["default"] or found["required"]
-    return Option(asked, told if found is None else told[: found.start()], default)
+    if found is None:
+        return Option(asked, told, "")
+    return Option(asked, told[: found.start()], f"`{found['default']}`" if found["default"] else found["required"])
 
 
 def page(command: str) -> str:
@@ -96,7 +97,7 @@ def page(command: str) -> str:
     parts = [f"# refield {command}", _prose(about), "```sh\n" + "\n".join([usage, *module.EXAMPLES]) + "\n```"]
     for box in boxes(whole):
         kept = [o for o in box.options if not any(o.asked.endswith(name) for name in _ALL_TAKE)]
-        rows = [f"| {_code(o.asked)} | {_prose(o.told)} | {_code(o.default)} |" for o in kept]
+        rows = [f"| `{o.asked}` | {_prose(o.told)} | {o.default} |" for o in kept]
         if rows:
             head = [f"## {box.title}", _prose(box.about)]
             parts += [*head, "\n".join(["| | | by default |", "|---|---|---|", *rows])]
@@ -107,10 +108,6 @@ def _prose(text: str) -> str:
     """Words that hold no Markdown but ``code``."""
     parts = re.split(r"(``.+?``|`.+?`)", " ".join(text.split()))
     return "".join(p if i % 2 else re.sub(r"([\\*_<>\[\]|#])", r"\\\1", p) for i, p in enumerate(parts))
-
-
-def _code(text: str) -> str:
-    return f"`{text}`" if text else ""
 
 
 def contents() -> str:

@@ -7,8 +7,12 @@ import functools
 import importlib.util
 import re
 import shlex
+import shutil
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import ModuleType
 
@@ -21,6 +25,7 @@ from tests.test_command_line import OPTION, help_of, options_in
 
 ROOT = Path(__file__).parent.parent
 WORDS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 OURS = [p for p in WORDS if p.name != "results.md"]  # it tells of the benchmarks' options, too
 
 
@@ -80,14 +85,58 @@ def test_options_that_are_spoken_of_are_there(page: Path) -> None:
     assert not {name for name in spoken - known if not any(k.startswith(f"{name}.") for k in known)}
 
 
-def test_it_builds_without_a_warning_and_fetches_nothing(tmp_path: Path) -> None:
-    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The manual, built as continuous integration builds it."""
+    folder = tmp_path_factory.mktemp("manual") / "site"
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
     done = subprocess.run(build, cwd=ROOT, env={**HERE, "NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True)
     assert done.returncode == 0 and "WARNING" not in done.stderr, done.stderr
-    pages = list((tmp_path / "site").rglob("*.html"))
+    return folder
+
+
+def test_no_page_asks_for_anything_elsewhere(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
     assert len(pages) > len(COMMANDS) + len(OURS)
     fetched = r"<(?:script|img|iframe|source|link)\b[^>]*?\b(?:src|href)=[\"']?(?:https?:)?//[^\s\"'>]+"
     for page in pages:
         assert not re.findall(fetched, page.read_text(encoding="utf-8")), page
-    for style in (tmp_path / "site").rglob("*.css"):
+    for style in site.rglob("*.css"):
         assert not re.findall(r"url\([\"']?(?:https?:)?//", style.read_text(encoding="utf-8")), style
+
+
+@pytest.fixture(scope="module")
+def served(site: Path) -> Iterator[str]:
+    """Its address on this machine."""
+    handler = functools.partial(Quiet, directory=str(site))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)")
+def test_a_browser_finds_an_option_and_asks_nobody_else(served: str) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install 'refield[dev]')")
+    asked: list[str] = []
+    with sync_api.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1200, "height": 900})
+        page.on("request", lambda request: asked.append(request.url))
+        faults: list[object] = []
+        page.on("pageerror", lambda fault: faults.append(fault))
+        page.goto(f"{served}/index.html")
+        page.locator(".md-search__input").click()
+        page.keyboard.type("photo-memory GB pixels")
+        found = page.locator(".md-search-result__link[href*='options/train.html']").first
+        sync_api.expect(found).to_be_attached()
+        page.goto(str(found.get_attribute("href")))
+        sync_api.expect(page.locator("td code", has_text="--fit.photo-memory").first).to_be_visible()
+        browser.close()
+    assert not faults
+    assert asked and not [url for url in asked if not url.startswith((served, "data:", "blob:"))]
