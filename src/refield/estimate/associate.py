@@ -6,7 +6,7 @@ next is looked for. So two newcomers whose hulls run together are told apart by 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 
@@ -136,17 +136,14 @@ class Fit:
 def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> Settled:
     """Find each old object's new place or that it left, and what else arrived."""
     touched = [k for k, old in enumerate(olds) if changed_share(changed, old) >= ground.believe.touched]
-    views = look_past(ground.field, changed, ground.memory, [olds[k] for k in touched], (ground.detect, ground.carving))
-    moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, views)
+    moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, changed)
     trimmed_some = any(placed[k] is not olds[k] for k in touched)
     olds = [placed.get(k, old) for k, old in enumerate(olds)]
     shares = {k: _gone(ground, views, olds[k]) for k in touched if k not in moved}
     removed = {k: share for k, share in shares.items() if share is not None}
     kept = [k for k in touched if k in moved or k in removed]
     if len(kept) < len(touched) or trimmed_some:  # what never left hides what is behind it after all
-        views = look_past(
-            ground.field, changed, ground.memory, [olds[k] for k in kept], (ground.detect, ground.carving)
-        )
+        views = _without(ground, changed, [olds[k] for k in kept])
         for k, change in moved.items():
             views = take_off(ground.field, views, olds[k], change)
     gone = [olds[k] for k in kept]
@@ -182,8 +179,11 @@ def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
     """Whether an object's pixels changed and show what was behind it."""
     if changed_share(changed, old) < ground.believe.touched:
         return False
-    views = look_past(ground.field, changed, ground.memory, [old], (ground.detect, ground.carving))
-    return _gone(ground, views, old) is not None
+    return _gone(ground, _without(ground, changed, [old]), old) is not None
+
+
+def _without(ground: Ground, changed: Sequence[Changed], olds: Sequence[Old]) -> list[Past]:
+    return look_past(ground.field, changed, ground.memory, olds, (ground.detect, ground.carving))
 
 
 def _gone(ground: Ground, views: Sequence[Past], old: Old) -> float | None:
@@ -193,11 +193,30 @@ def _gone(ground: Ground, views: Sequence[Past], old: Old) -> float | None:
 
 
 def _place_all(
-    ground: Ground, olds: dict[int, Old], views: list[Past]
+    ground: Ground, olds: dict[int, Old], changed: Sequence[Changed]
 ) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:
-    """Place the old objects that fit somewhere, the best first, taking each off the photos."""
+    """Place the old objects that fit somewhere, in the photos without those that certainly left, then without all.
+
+    What a newcomer hides may look like a thing that changed; where that is taken out, nobody knows what is behind, and
+    the newcomer is not looked for.
+    """
+    sure = [k for k, old in olds.items() if looks_gone(ground, changed, old)]
     moved: dict[int, PoseChange] = {}
-    tried = list(olds.items())[: ground.believe.most]
+    for out in [sure, list(olds)] if 0 < len(sure) < len(olds) else [list(olds)]:
+        views = _without(ground, changed, [olds[k] for k in out])
+        for k, change in moved.items():
+            views = take_off(ground.field, views, olds[k], change)
+        more, views, placed = _place(ground, {k: olds[k] for k in out}, moved, views)
+        moved, olds = moved | more, olds | placed
+    return moved, views, olds
+
+
+def _place(
+    ground: Ground, olds: dict[int, Old], before: Mapping[int, PoseChange], views: list[Past]
+) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:
+    """Place objects that ``views`` are without and that were not placed ``before``, the best first, taking each off."""
+    moved: dict[int, PoseChange] = {}
+    tried = [item for item in olds.items() if item[0] not in before][: ground.believe.most]
     everyone, asked = list(olds.values()), views
     guess = cache(lambda k: matched_poses(olds[k], asked, ground.survey, ground.matcher))
     while True:
@@ -296,7 +315,7 @@ def _only_light(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
     alike, shown = 0, 0
     for p in past:
         here = shadow_of(p.view, ground.hull.lattice, part) & p.open
-        alike += int((here & even_and_grey(log_ratio(p.view, p.rgb, ground.detect), ground.detect)).sum())
+        alike += int((here & even_and_grey(log_ratio(p.view, p.rgb, ground.detect))).sum())
         shown += int(here.sum())
     return alike > 0.5 * shown
 
