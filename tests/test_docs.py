@@ -15,6 +15,10 @@ import pytest
 
 import refield
 from refield.cli import COMMANDS
+from refield.field.fit import FitConfig
+from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig
+from refield.update.config import UpdateConfig
+from refield.update.train import _RING_RAYS
 from tests.reach import reached
 
 ROOT = Path(__file__).parent.parent
@@ -85,6 +89,21 @@ def test_what_the_method_names_is_run_by_someone() -> None:
             assert not named & reached(), row
         else:
             assert named <= reached(), f"{sorted(named - reached())} in: {row}"
+
+
+def test_numbers_of_the_method_are_those_that_are_used() -> None:
+    told = (ROOT / "docs/method.md").read_text(encoding="utf-8")
+    update, fit = UpdateConfig(), NerfactoFitConfig()
+    assert f"box {update.dilation:g} times as large (`--update.dilation`)" in told
+    assert update.ground == 2 and "within twice its size (`--update.ground`)" in told
+    assert update.sparse_share == 0.5 and "half of the rays from the new photos (`--update.sparse-share`)" in told
+    assert f"{update.steps} steps at most" in told
+    assert f"the paper's {update.shadow:g} and {update.far:g} of the width" in told
+    assert f"of what they leave {_RING_RAYS // 1000} 000 rays" in told
+    assert f"({fit.steps // 1000} 000 steps of {fit.rays} rays)" in told
+    assert f"{REDUCED.steps} steps of {REDUCED.rays} rays" in told
+    weights = {FitConfig().distortion, update.distortion}
+    assert weights == {0.01} and f"is 0.01 for our field and the helper, nerfstudio's {fit.distortion:g}" in told
 
 
 def test_what_nobody_runs_is_found_to_be_so() -> None:

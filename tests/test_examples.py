@@ -192,13 +192,14 @@ def test_what_the_readme_shows_in_python(small, changed, work, tmp_path, monkeyp
 
 
 def test_the_tour_is_walked(tmp_path, monkeypatch, capsys) -> None:
-    """Every command of docs/tour.md in its order, of a clone; the demo's fit alone is shorter."""
+    """Every command of docs/tour.md in its order, of a clone, and then the manual's pictures of the demo's stages are
+    drawn; the demo's fit alone is shorter."""
     (tmp_path / "src").symlink_to(ROOT / "src")
     monkeypatch.chdir(tmp_path)
     tour, said = ROOT / "docs" / "tour.md", {}
     for line in typed(tour):
         _, command, *arguments = shlex.split(line, comments=True)
-        assert main([command, *arguments, *(["--fit.steps", "300"] if command == "demo" else [])]) == 0, line
+        assert main([command, *arguments, *(["--fit.steps", "500"] if command == "demo" else [])]) == 0, line
         said[command] = capsys.readouterr().out
     assert list(said) == ["demo", "visits", "render", "update", "undo", "export"]
     assert "1 object changed: 1 moved" in said["demo"] and "moved from" in said["visits"]
@@ -208,3 +209,9 @@ def test_the_tour_is_walked(tmp_path, monkeypatch, capsys) -> None:
     (block,) = re.findall(r"```python\n(.*?)```", tour.read_text(encoding="utf-8"), re.DOTALL)
     exec(compile(block, "tour.md", "exec"), {})
     assert "moved" in capsys.readouterr().out and difference(Path("was.png"), Path("is.png")) > 1
+    monkeypatch.setattr(sys, "argv", ["stages.py", "refield-demo", "--out", "pictures"])
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_path(str(ROOT / "benchmarks" / "stages.py"), run_name="__main__")
+    shown = re.findall(r"images/stages/(\w+\.webp)", (ROOT / "docs" / "stages.md").read_text(encoding="utf-8"))
+    made = {path.name: path.stat().st_size for path in Path("pictures").iterdir()}
+    assert {*shown} - {"report.webp"} <= made.keys() <= {*shown} and max(made.values()) < 150_000
