@@ -60,7 +60,7 @@ class AssociateConfig:
     """by how much more than the old rendering did"""
     alike: float = 0.5
     """part of the pixels at its new place that look as before; if it is more, it must gain twice as much"""
-    refined: int = 2
+    refined: int = 6
     """candidates of an object that are refined"""
     gone: float = 0.45
     """part of an object's pixels that must show what was behind it, for it to have left"""
