@@ -225,7 +225,7 @@ def _place(
         # what moved before moves again: a piece of something else is tried only on what that leaves unexplained
         for again in (True, False):
             some = [k for k, old in tried if old.remembered == again and k not in moved and parts]
-            tries = {k: best_fit(ground, olds[k], everyone, views, parts, guess(k)) for k in some}
+            tries = {k: _best_of(ground, olds[k], everyone, views, parts, guess(k)) for k in some}
             fits |= {k: fit for k, fit in tries.items() if fit is not None}
             if any(fit.change.explained >= ground.believe.shown for fit in fits.values()):
                 break
@@ -370,6 +370,19 @@ def _places_in(lattice: Lattice, inner: Array, old: Old) -> Array:
         chosen.append(int(nearest.argmax()))
         nearest = np.minimum(nearest, np.linalg.norm(at - at[chosen[-1]], axis=-1))
     return at[chosen].astype(np.float32)
+
+
+def _best_of(
+    ground: Ground,
+    old: Old,
+    olds: Sequence[Old],
+    past: Sequence[Past],
+    parts: Sequence[Voxels],
+    extra: Sequence[Tensor],
+) -> Fit | None:
+    """The better fit of the outlines that an object may have."""
+    fits = [best_fit(ground, o, olds, past, parts, extra) for o in (old, old.instead) if o is not None]
+    return max((f for f in fits if f is not None), key=lambda f: f.change.explained, default=None)
 
 
 def best_fit(
