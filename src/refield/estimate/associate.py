@@ -66,10 +66,9 @@ class AssociateConfig:
     """part of an object's pixels that must show what was behind it, for it to have left"""
     arrived: float = 0.5
     """part of a newcomer's pixels that nothing else explains"""
-    newcomer: float = 0.01
-    """part of a photo that something new must fill in at least one of them"""  # the paper's contour area, §10.2.2
-    crumb: float = 0.003
-    """part of a photo that an object which was overlooked at first must fill in at least one of them"""
+    smallest: float = 0.003
+    """part of a photo that something new, or an object which was overlooked at first, must fill in one at least;
+    the paper's contour area is 1 % (§10.2.2)"""
     trim: float = 0.03
     """part of an object's voxels that the new photos or the ground deny, from which on it is trimmed"""
     core: float = 0.25
@@ -289,7 +288,7 @@ def newcomers(ground: Ground, voxels: Voxels, past: Sequence[Past]) -> list[Voxe
 def _substantial(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
     """Whether a would-be newcomer is large enough in some photo; what is left over at the edge of others is not."""
     shadows = [shadow_of(p.view, ground.hull.lattice, part) & p.open for p in past]
-    return max(float(s.mean()) for s in shadows) >= ground.believe.newcomer
+    return max(float(s.mean()) for s in shadows) >= ground.believe.smallest
 
 
 def _rim_of(ground: Ground, part: Voxels, old: Old, new_from_old: Tensor) -> bool:

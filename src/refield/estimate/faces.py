@@ -74,8 +74,10 @@ def changed_parts(
 
 
 def _where(points: Array, changed: Sequence[Changed], marked: Sequence[Mask], config: HullConfig) -> Mask:
-    """Points (N, 3) at which, or before which, most views show a thing, and none shows anything else. Views in which the
-    segmenter finds next to nothing say nothing."""
+    """Points (N, 3) at which, or before which, most views show a thing, and none shows anything else.
+
+    Views in which the segmenter finds next to nothing say nothing.
+    """
     shown = [(c, c.mask & mask) for c, mask in zip(changed, marked)]
     told = [(c.witness(), pixels.dilate(m, config.margin)) for c, m in shown if m.sum() > _SPEAKS * c.mask.sum()]
     count, against = votes(points, told, config)

@@ -280,7 +280,7 @@ def _overlooked(scene: _Scene, ground: Ground, settled: Settled, parts: Parts, k
         needed = unexplained(ground, settled, part)
         if needed or part.sum() >= least:
             found = _were_there(scene, ground.hull, [part], part, [*known, *more])
-            found = [o for o in found if o.remembered or not is_crumb(scene.changed, o, ground.believe.crumb)]
+            found = [o for o in found if o.remembered or not is_crumb(scene.changed, o, ground.believe.smallest)]
             more += [old for old in found if needed or looks_gone(ground, scene.changed, old)]
     return more
 
