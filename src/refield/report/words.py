@@ -11,8 +11,8 @@ from datetime import datetime
 import torch
 from torch import Tensor
 
-from refield.report.boxes import upright_box
 from refield.report.visit import lengths, object_shift, turn, uncertainty
+from refield.scene.boxes import upright_box
 from refield.scene.change import Kind, ObjectChange, SceneChange
 from refield.scene.world import World
 
