@@ -46,6 +46,9 @@ class Splats:
     def __len__(self) -> int:
         return len(self.means)
 
+    def __getitem__(self, index: Tensor) -> Splats:
+        return Splats(*(getattr(self, f.name)[index] for f in fields(self)))
+
 
 def splats_of(surface: Surface, views: Sequence[View]) -> Splats:
     """Discs on the surfaces, and the dome on which lies what the views show beyond them."""

@@ -28,6 +28,7 @@ _PLAN_NOTE = (
     "The scene from above, seen as the first new photo looks. Dashed: where a thing was. Filled: where it is now. "
     "Wedges: where the new photos were taken."
 )
+_BY_HAND = "Before and after, from where old photos were taken"
 
 
 def html_page(report: VisitReport) -> str:
@@ -84,7 +85,8 @@ def _parts(report: VisitReport) -> Iterable[str]:
     photos = [v for v in report.photos if v.name not in rejected]
     views = report.evaluation_views[:MOST_VIEWS]
     most = ALL_PIXELS / max(pictures_in([*photos, *views]), 1)
-    yield _cards("New photos", "Photo", photos, report, most)
+    heads = (_BY_HAND, "View") if report.change.by_hand else ("New photos", "Photo")
+    yield _cards(*heads, photos, report, most)
     yield _rejected(report)
     yield _cards("How true is it? Views that took no part in the update", "View", views, report, most)
     yield _technical(report)
@@ -94,7 +96,7 @@ def _header(report: VisitReport) -> str:
     change = report.change
     made = f'<time datetime="{report.made.isoformat(timespec="seconds")}">{words.date(report.made)}</time>'
     used = len(change.frames)
-    seen = f"{used} new photo{'' if used == 1 else 's'}"
+    seen = "by hand" if change.by_hand else f"{used} new photo{'' if used == 1 else 's'}"
     over = f'<p class="over">{escape(report.title)} · {made} · {seen}</p>'
     lead = "".join(f'<p class="lead">{escape(text)}</p>' for text in _lead(report))
     return f"<header>{over}<h1>{escape(words.headline(change))}</h1>{lead}{_links(report)}</header>"
