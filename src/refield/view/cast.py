@@ -30,6 +30,7 @@ from refield.workspace import VIEWED, Workspace
 SPLATS = 150_000
 """of a state, at most, and those of its far dome: as many as a browser without a graphics card turns smoothly"""
 _GLIMPSE_VIEWS, _GLIMPSE_RAYS = 16, 60_000
+_DOME = 6_000  # splats on a whole sphere around the scene: what is far off is blurred here
 _VIEW_RAYS = 1_200_000  # that the splats' surface is looked for along
 
 Progress = Callable[[int, int], None]
@@ -63,7 +64,7 @@ def splats_for(
 ) -> Splats:
     """A state as splats, as an export has it, but fewer."""
     views = views_of(field, frames, on_progress, rays=_VIEW_RAYS)
-    return splats_of(surface_of(field, views, most), views)
+    return splats_of(surface_of(field, views, most), views, _DOME)
 
 
 def name_of_state(workspace: Workspace, visit: int, most: int = SPLATS) -> str:

@@ -36,6 +36,8 @@ def draw_glimpse(scene: SceneApi, stage: Stage, glimpse: Glimpse) -> None:
 
 def draw_splats(scene: SceneApi, stage: Stage, splats: Splats, name: str = STATE, **pose: Any) -> None:
     """Splats, by default in place of what was drawn of another state; ``pose``: of the node, viser's words."""
+    # from afar first: a browser that has not sorted them yet draws them in this order
+    splats = splats[(splats.means.double() - stage.middle).norm(dim=1).argsort(descending=True)]
     scene.add_gaussian_splats(
         name,
         stage.points(splats.means),

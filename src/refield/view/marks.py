@@ -30,7 +30,7 @@ WAS, IS = (249, 115, 22), (16, 185, 199)
 MARKS, CAMERAS = "/marks", "/photos"
 _OLD, _NEW = (120, 120, 128), (147, 51, 234)  # frames of old and of new photos
 _LINE, _ARROW = 2.5, 0.012  # pixels; units of the stage
-_FRUSTUM = 0.25  # units of the stage, of which so much is left where photos crowd
+_FRUSTUM = 0.15  # units of the stage, of which so much is left where photos crowd
 _THUMBNAIL = {False: 96, True: 256}  # pixels of the longer side, of old and of new photos
 _MOST_OLD = 60
 _EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
@@ -72,11 +72,12 @@ def draw_marks(scene: SceneApi, stage: Stage, change: SceneChange, world: World,
             f"{name}/box", edges(stage.points(corners)), colour, thickness=_LINE, thickness_units="screen"
         )
         told = str(place.number) if place.now or _left(change, place) else f"{place.number}: before"
-        top = place.box.world_from_box[:3, 3] + place.box.world_from_box[:3, 2] * place.box.size[2] / 2
-        scene.add_label(f"{name}/number", told, position=stage.point(top), anchor="bottom-center")
-    arrows = [(o.centre, o.centre + o.shift) for o in change.objects if o.shift is not None]
-    if arrows:
-        ends = stage.points(torch.stack([torch.stack(pair) for pair in arrows]))
+        scene.add_label(f"{name}/number", told, position=stage.point(_top(place)), anchor="bottom-center")
+    moved = [o.kind == "moved" for o in change.objects]
+    if any(moved):
+        tops = {(p.number, p.now): _top(p) for p in places}
+        pairs = [(tops[n, False], tops[n, True]) for n, went in enumerate(moved, 1) if went]
+        ends = stage.points(torch.stack([torch.stack(pair) for pair in pairs]))
         thick = min(_ARROW, 0.1 * float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1).min()))
         scene.add_arrows(
             f"{under}/arrows", ends, IS, shaft_radius=thick, head_radius=2.5 * thick, head_length=6 * thick
@@ -86,6 +87,12 @@ def draw_marks(scene: SceneApi, stage: Stage, change: SceneChange, world: World,
 def edges(corners: Array) -> Array:
     """The twelve edges (12, 2, 3) of a box by its corners (8, 3), as `UprightBox.corners` has them."""
     return np.stack([corners[[a, b]] for a, b in _EDGES])
+
+
+def _top(place: Place) -> Tensor:
+    """(3,) the middle of a box's upper side, where nothing hides an arrow."""
+    pose = place.box.world_from_box
+    return pose[:3, 3] + pose[:3, 2] * place.box.size[2] / 2
 
 
 def _left(change: SceneChange, place: Place) -> bool:

@@ -106,12 +106,12 @@ def opened_server(port: int) -> ViserServer:
 
     if not 0 <= port <= 65535:
         raise InputError("--port", f"{port} is none", "give 0 (any that is free) to 65535")
-    with _for_our_pages_alone():
+    with _for_our_pages_alone(), contextlib.redirect_stdout(io.StringIO()):
         return viser.ViserServer(host=HOST, port=port, verbose=False)
 
 
 def stop(server: ViserServer) -> None:
-    """Stop listening, without a word."""
+    """Stop listening; what viser has to say of it nobody asked for."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 

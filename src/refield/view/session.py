@@ -35,7 +35,7 @@ class Session:
         self._lock = threading.RLock()
         self._visit = scenery.latest
         self._standing = StandingView(self._state, self._show_picture, scenery.turns)
-        self._sharp = False
+        self._sharp = self._closed = False
         self._photos: str | None = None
         self.panel = Panel(client.gui, scenery, self._changed)
         self.mover = Mover(client, scenery, self.panel, self._saved)
@@ -56,6 +56,7 @@ class Session:
 
     def close(self) -> None:
         """The browser is gone."""
+        self._closed = True
         self._standing.end()
 
     def refresh(self) -> None:
@@ -191,6 +192,8 @@ class Session:
         self._standing.look(Looking(lens, pose, self._visit, before, self.panel.layer, self.panel.wipe))
 
     def _show_picture(self, picture: Picture) -> None:
+        if self._closed:
+            return
         depth = np.nan_to_num(picture.depth * self.scenery.stage.scale, posinf=_EMPTY).clip(0, _EMPTY)
         with self._lock, self.client.atomic():
             self.client.scene.set_background_image(picture.rgb, format="jpeg", jpeg_quality=_QUALITY, depth=depth)

@@ -1,5 +1,18 @@
 "use strict";
 (() => {
+  // browsers run no worker of a page that is a file if it is a module made of text, but one whose text is its address
+  if (location.protocol === "file:") {
+    const Own = window.Worker;
+    window.Worker = class extends Own {
+      constructor(address, options) {
+        const text = new XMLHttpRequest();
+        text.open("GET", address, false);
+        text.send();
+        super("data:text/javascript;charset=utf-8," + encodeURIComponent(text.responseText), options);
+      }
+    };
+  }
+
   const STEPS = 4; // of a state: without and with photos, without and with boxes
   const at = (id) => document.getElementById(id);
   const visit = at("visit");

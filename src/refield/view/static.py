@@ -11,6 +11,7 @@ from html import escape
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
+from refield.report.page import GENERATOR
 from refield.scene.errors import InputError
 from refield.view.draw import draw_splats, look_from_afar
 from refield.view.marks import CAMERAS, MARKS, Shot, draw_marks, draw_shot, frustum_size, pictured, shots_of
@@ -22,8 +23,6 @@ from refield.view.told import told
 if TYPE_CHECKING:
     from viser import SceneApi, ViserServer
 
-GENERATOR = '<meta name="generator" content="refield view">'
-"""by which a page of ours is known"""
 ALL_SPLATS = 400_000
 """of all states of a page together, about and at most"""
 _FEWEST = 20_000  # of a state
