@@ -21,6 +21,7 @@ _REACH, _GROWTH = 0.08, 0.6  # of the cameras' distance: half a side of the firs
 _LARGEST = 1.0  # of the cameras' distance: a box that is larger holds more than a thing
 _VOXELS = 40  # along a box's side
 _SMALLEST = 30  # voxels
+_HIGH = 4.0  # voxels: what rises less above what it lies on is that
 _NEAR = 2.5  # voxels: how far from the point a thing may begin
 
 
@@ -41,10 +42,9 @@ def thing_at(field: Field, capture: Capture, x: Tensor) -> OccupancyGrid | None:
         planes = _planes(patches, low, high)
         lattice = Lattice.over(low, high, _VOXELS)
         found = _component(lattice, patches, planes, point)
-        if found is None:
-            return None
-        before, beyond = _touched(found)
-        if not before.any() and not beyond.any():
+        # in a box that holds little more than one of its faces, that face is taken for ground
+        before, beyond = (np.ones(3, bool), np.ones(3, bool)) if found is None else _touched(found)
+        if found is not None and not before.any() and not beyond.any():
             return _whole(field, capture.train, lattice, found, planes)
         side = high - low
         low, high = low - _GROWTH * side * before, high + _GROWTH * side * beyond
@@ -79,7 +79,8 @@ def _component(lattice: Lattice, patches: list[Patch], planes: list[Plane], poin
     apart = np.linalg.norm(lattice.centres - point, axis=-1)
     for part in components(solid, _SMALLEST):
         if apart[part].min() < _NEAR * lattice.cell:
-            return part
+            high = (float(plane.height(lattice.centres[part]).max()) for plane in planes)
+            return part if all(h > _HIGH * lattice.cell for h in high) else None
     return None
 
 
