@@ -90,6 +90,6 @@ def test_motions_that_are_none(made, motion, fault):
     grid = scene.change(1).objects[1].grid
     with pytest.raises(refield.InputError, match=fault):
         scene.move(grid, motion)
-    with pytest.raises(TypeError, match="the thing to move is None; give one of scene.things"):
+    with pytest.raises(TypeError, match=r"the thing to move is None; give one of scene\.things"):
         scene.move(None, motion)
     assert contents(made) == before

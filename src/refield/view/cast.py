@@ -64,7 +64,7 @@ def splats_for(
 ) -> Splats:
     """A state as splats, as an export has it, but fewer."""
     views = views_of(field, frames, on_progress, rays=_VIEW_RAYS)
-    return splats_of(surface_of(field, views, most), views, _DOME)
+    return splats_of(surface_of(field, views, most), views, min(_DOME, most // 8))
 
 
 def name_of_state(workspace: Workspace, visit: int, most: int = SPLATS) -> str:

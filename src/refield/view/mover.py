@@ -68,6 +68,24 @@ class Mover:
         self._back.on_click(lambda _: self.let_go())
         self._undo.on_click(lambda _: self._alone(self._take_back, "Taking it back …"))
 
+    @property
+    def held(self) -> Held | None:
+        """What is being moved."""
+        return self._held
+
+    @property
+    def reach(self) -> float:
+        """How long the gizmo's arrows are, units of the stage."""
+        return 0.0 if self._gizmo is None else float(self._gizmo.scale)
+
+    @property
+    def moved_by(self) -> float:
+        """How far it was dragged, world units."""
+        if self._held is None or self._gizmo is None:
+            return 0.0
+        there = self._scenery.stage.world_points(self._gizmo.position)
+        return float((there - self._held.world_from_box[:3, 3]).norm())
+
     def offer(self, visit: int) -> None:
         """Things can be moved in the latest state alone."""
         self.let_go()

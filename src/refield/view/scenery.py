@@ -76,8 +76,15 @@ class Scenery:
         return (*self.capture.frames, *(f for change in self.changes[:visit] for f in change.frames))
 
     def field(self, visit: int) -> Field:
-        """The field after a visit."""
-        return _kept(self._fields, self._names[visit], _FIELDS, lambda: state(self.workspace, visit))
+        """The field after a visit.
+
+        Raises:
+            InputError: there is no such visit, or no longer; or its files are damaged.
+        """
+        names = self._names
+        if visit >= len(names):
+            raise InputError(self.workspace.path, f"there is no visit {visit} any longer", "choose another")
+        return _kept(self._fields, names[visit], _FIELDS, lambda: state(self.workspace, visit))
 
     def glimpse(self, visit: int) -> Glimpse:
         """Points of a state."""

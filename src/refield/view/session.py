@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle
 
 _QUALITY = 92  # of our own pictures, as JPEG
+_FIRST = 3.0  # seconds after which states are drawn even if no picture of ours is there yet
 _EMPTY = 160.0  # units of the stage, about as far as viser's depths reach: where nothing is
 
 
@@ -35,7 +37,8 @@ class Session:
         self._lock = threading.RLock()
         self._visit = scenery.latest
         self._standing = StandingView(self._state, self._show_picture, scenery.turns)
-        self._sharp = self._closed = False
+        self._sharp, self._closed = True, False  # until the first picture is there nothing else need be drawn
+        self._waits_until = time.monotonic() + _FIRST
         self._photos: str | None = None
         self.panel = Panel(client.gui, scenery, self._changed)
         self.mover = Mover(client, scenery, self.panel, self._saved)
@@ -52,7 +55,7 @@ class Session:
         self.show(self.scenery.latest)
         self._standing.start()
         self.client.camera.on_update(self._moved)
-        self._moved(self.client.camera)
+        self._look()
 
     def close(self) -> None:
         """The browser is gone."""
@@ -80,8 +83,13 @@ class Session:
     def splats_ready(self, visit: int) -> None:
         """The splats of a state can be shown now."""
         with self._lock:
-            if visit == self._visit:
+            if visit == self._visit and not self._closed:
                 self._draw_state()
+
+    @property
+    def finest(self) -> bool:
+        """Whether the standing view is shown as sharp as it gets."""
+        return self._sharp and self._standing.finest
 
     @property
     def _change(self) -> SceneChange | None:
@@ -197,12 +205,12 @@ class Session:
         depth = np.nan_to_num(picture.depth * self.scenery.stage.scale, posinf=_EMPTY).clip(0, _EMPTY)
         with self._lock, self.client.atomic():
             self.client.scene.set_background_image(picture.rgb, format="jpeg", jpeg_quality=_QUALITY, depth=depth)
-            self._sharp = True
+            self._sharp, self._waits_until = True, 0.0
             self._hide_state(True)
 
     def _unsharpen(self) -> None:
         with self._lock:
-            if self._sharp:
+            if self._sharp and time.monotonic() > self._waits_until:
                 self._sharp = False
                 with self.client.atomic():
                     self._hide_state(False)

@@ -5,6 +5,7 @@ Of each state that is shown the renderings of the present view are kept, so that
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ from refield.field.render import render_many
 from refield.field.volrend import Rendering
 from refield.scene.camera import Camera
 from refield.scene.capture import Rays, camera_rays
+from refield.scene.errors import InputError
 from refield.view.marks import IS, WAS
 from refield.view.turns import Turns
 
@@ -79,6 +81,8 @@ class StandingView:
     _wanted: Looking | None = None
     _count: int = 0
     """of requests; whoever works for an earlier one stops"""
+    _shown: int = -1
+    """the request whose finest picture is shown"""
     _ended: bool = False
     _changed: threading.Condition = field(default_factory=threading.Condition)
     _kept: dict[tuple[int, float], Rendering] = field(default_factory=dict)
@@ -95,6 +99,11 @@ class StandingView:
         with self._changed:
             self._wanted, self._count = wanted, self._count + 1
             self._changed.notify_all()
+
+    @property
+    def finest(self) -> bool:
+        """Whether what was asked for last is shown as finely as it gets."""
+        return self._shown == self._count
 
     def end(self) -> None:
         """Stop for good."""
@@ -113,7 +122,8 @@ class StandingView:
                 again = wanted is not None and self._place is not None and wanted.same_place(self._place)
                 moved = not again and self._await_other(done, REST)
             if wanted is not None and not moved:
-                self._render(wanted, done)
+                with contextlib.suppress(InputError):  # of a visit that was taken back meanwhile
+                    self._render(wanted, done)
 
     def _await_other(self, than: int, seconds: float | None) -> bool:
         """Whether another request than this comes; or the end."""
@@ -134,6 +144,7 @@ class StandingView:
             if self._count != request:
                 return
             self.show(composed(wanted, camera, [self._kept[n, part] for n in wanted.states]))
+        self._shown = request
 
     def _seen(self, number: int, camera: Camera, world_from_cam: Tensor, request: int) -> Rendering | None:
         """A state's rendering; None if something else was asked for meanwhile."""
