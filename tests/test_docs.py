@@ -15,6 +15,11 @@ import pytest
 
 import refield
 from refield.cli import COMMANDS
+from refield.field.fit import FitConfig
+from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig
+from refield.update.config import UpdateConfig
+from refield.update.train import _RING_RAYS
+from tests.reach import reached
 
 ROOT = Path(__file__).parent.parent
 SOURCE = ROOT / "src" / "refield"
@@ -60,10 +65,69 @@ def test_every_equation_of_the_paper_has_its_place() -> None:
     assert all(places.values()), [n for n, there in places.items() if not there]
 
 
+NOT_RUN = "not run by the commands"
+
+
+def rows_of_the_method() -> list[str]:
+    rows = [r for r in (ROOT / "docs/method.md").read_text(encoding="utf-8").splitlines() if REFERENCE.search(r)]
+    return [r for r in rows if r.startswith("|")]
+
+
+def test_every_row_of_the_method_says_how_it_differs() -> None:
+    assert len(rows_of_the_method()) > 70
+    assert not [row for row in rows_of_the_method() if not row.rstrip().removesuffix("|").rpartition("|")[2].strip()]
+
+
+def test_what_the_method_names_is_run_by_someone() -> None:
+    """Each function follows from a command or a public name; or its row says that it does not."""
+    for row in rows_of_the_method():
+        named = {
+            (file.removesuffix(".py").replace("/", ".").removesuffix(".__init__"), n)
+            for file, n in REFERENCE.findall(row)
+        }
+        if NOT_RUN in row:
+            assert not named & reached(), row
+        else:
+            assert named <= reached(), f"{sorted(named - reached())} in: {row}"
+
+
+def test_numbers_of_the_method_are_those_that_are_used() -> None:
+    told = (ROOT / "docs/method.md").read_text(encoding="utf-8")
+    update, fit = UpdateConfig(), NerfactoFitConfig()
+    assert f"box {update.dilation:g} times as large (`--update.dilation`)" in told
+    assert update.ground == 2 and "within twice its size (`--update.ground`)" in told
+    assert update.sparse_share == 0.5 and "half of the rays from the new photos (`--update.sparse-share`)" in told
+    assert f"{update.steps} steps at most" in told
+    assert f"the paper's {update.shadow:g} and {update.far:g} of the width" in told
+    assert f"of what they leave {_RING_RAYS // 1000} 000 rays" in told
+    assert f"({fit.steps // 1000} 000 steps of {fit.rays} rays)" in told
+    assert f"{REDUCED.steps} steps of {REDUCED.rays} rays" in told
+    weights = {FitConfig().distortion, update.distortion}
+    assert weights == {0.01} and f"is 0.01 for our field and the helper, nerfstudio's {fit.distortion:g}" in told
+
+
+def test_what_nobody_runs_is_found_to_be_so() -> None:
+    run = reached()
+    assert ("update.train", "update_field") in run  # a public name
+    assert ("estimate.register", "register") in run  # called from far away
+    assert ("update.composite", "UpdatedField._route") in run  # a method, of something built elsewhere
+    assert ("field.kernels.cpu.step", "train_step") in run  # a twin, chosen by device
+    assert ("commands.undo", "run") in run
+    tests_alone = {
+        ("field.warp", "two_way"),
+        ("synthetic.oracles", "AnalyticField"),
+        ("scene.similarity", "similarity"),
+    }
+    benchmarks = {("baselines.retrain", "retrain"), ("baselines.inpaint", "Lama")}
+    assert not run & (tests_alone | benchmarks)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_links_between_documents_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
-        if "://" not in target:
+        if made := re.fullmatch(r"options/(\w+)\.md", target):  # by docs/options.py, when the manual is built
+            assert made[1] in {"index", *COMMANDS}, f"{page.name}: {target}"
+        elif "://" not in target:
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
@@ -85,6 +149,15 @@ def test_continuous_integration_runs_the_readmes_test_command() -> None:
     script = ROOT / ".ci" / "run"
     assert tests in script.read_text(encoding="utf-8").splitlines()
     assert os.access(script, os.X_OK)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/limits.md"])
+def test_tables_of_figures_hold_none_that_the_results_do_not(page: str) -> None:
+    held = (ROOT / "docs/results.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\|.*$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
+    figures = [f for row in rows for f in re.findall(r"\d+ of \d+|\d+/\d+|\d+\.\d+|\d+ trials", row)]
+    assert len(figures) > 5
+    assert not [f for f in figures if not re.search(rf"(?<![\d.]){re.escape(f)}(?!\.?\d)", held)]
 
 
 def test_demo_and_tests_are_one_line_each() -> None:

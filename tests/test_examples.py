@@ -1,10 +1,12 @@
 """What is shown in Python is run as it stands, scripts with their arguments and the README line by line, on a scene
-that is tiny: the steps' settings are small, and what several ask for alike, a fit or an estimate, is made once."""
+that is tiny: the steps' settings are small, and what several ask for alike, a fit or an estimate, is made once. The
+manual's tour is walked on the demo's scene."""
 
 from __future__ import annotations
 
 import re
 import runpy
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -27,6 +29,7 @@ from refield.update.train import update_field
 from refield.visits import opened
 from refield.visits.make import VisitConfig
 from tests.changed import FIT, FIT_OPTIONS, Changed, write_changed
+from tests.test_manual import typed
 
 pytestmark = pytest.mark.chain  # a minute or two in all
 ROOT = Path(__file__).parent.parent
@@ -186,3 +189,29 @@ def test_what_the_readme_shows_in_python(small, changed, work, tmp_path, monkeyp
     assert [o.kind for o in names["visit"].change.objects] == ["moved"]
     assert torch.allclose(names["visit"].change.objects[0].shift, changed.truth.shift, atol=0.05)
     assert refield.open("work").visits == ()
+
+
+def test_the_tour_is_walked(tmp_path, monkeypatch, capsys) -> None:
+    """Every command of docs/tour.md in its order, of a clone, and then the manual's pictures of the demo's stages are
+    drawn; the demo's fit alone is shorter."""
+    (tmp_path / "src").symlink_to(ROOT / "src")
+    monkeypatch.chdir(tmp_path)
+    tour, said = ROOT / "docs" / "tour.md", {}
+    for line in typed(tour):
+        _, command, *arguments = shlex.split(line, comments=True)
+        assert main([command, *arguments, *(["--fit.steps", "500"] if command == "demo" else [])]) == 0, line
+        said[command] = capsys.readouterr().out
+    assert list(said) == ["demo", "visits", "render", "update", "undo", "export"]
+    assert "1 object changed: 1 moved" in said["demo"] and "moved from" in said["visits"]
+    assert "nothing changed" in said["update"] and "visit 2 is taken back" in said["undo"]
+    assert Path("refield-demo/visits/001/report.html").is_file() and Path("files/changes.glb").is_file()
+    assert Path("film.webp").stat().st_size > 10_000 and Path("around.webp").stat().st_size > 10_000
+    (block,) = re.findall(r"```python\n(.*?)```", tour.read_text(encoding="utf-8"), re.DOTALL)
+    exec(compile(block, "tour.md", "exec"), {})
+    assert "moved" in capsys.readouterr().out and difference(Path("was.png"), Path("is.png")) > 1
+    monkeypatch.setattr(sys, "argv", ["stages.py", "refield-demo", "--out", "pictures"])
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_path(str(ROOT / "benchmarks" / "stages.py"), run_name="__main__")
+    shown = re.findall(r"images/stages/(\w+\.webp)", (ROOT / "docs" / "stages.md").read_text(encoding="utf-8"))
+    made = {path.name: path.stat().st_size for path in Path("pictures").iterdir()}
+    assert {*shown} - {"report.webp"} <= made.keys() <= {*shown} and max(made.values()) < 150_000

@@ -13,7 +13,7 @@ from refield.photos.sources import find_sources
 from refield.scene.errors import InputError
 from refield.scene.images import opened
 from refield.scene.load import is_posed, load_capture
-from refield.synthetic.textures import to_linear, to_srgb
+from refield.scene.srgb import to_linear, to_srgb
 
 STOPS, CAST = 0.5, 0.05
 """the most by which a photo's exposure is off, stops, and the gains of its red and blue"""

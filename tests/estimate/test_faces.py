@@ -33,7 +33,7 @@ def parts_of(views, masks):
     lattice = Lattice.over(np.array([-0.7, -0.5, -0.05], np.float32), np.array([0.8, 0.8, 0.7], np.float32), 60)
     carved = carve(lattice, list(zip(views, masks)), views, HullConfig())
     above = lattice.centres[..., 2] > 0.01
-    return lattice, changed_parts(changed, carved, above, 20, GrabCutSegmenter())
+    return lattice, changed_parts(changed, carved, above, HullConfig(smallest=20), GrabCutSegmenter())
 
 
 def test_two_things_that_changed_are_two_parts(views):

@@ -61,7 +61,7 @@ def stage(tmp_path_factory):
     region = recipe.hull.find_region(scene.changed, config.hull)
     carved, free = recipe._carved(scene, region)
     (old,) = recipe._were_there(
-        scene, carved, changed_parts(scene.changed, carved, free, 40, scene.models.segmenter)[0]
+        scene, carved, changed_parts(scene.changed, carved, free, HullConfig(smallest=40), scene.models.segmenter)[0]
     )
     past = look_past(BEFORE, scene.changed, scene.errors.memory, [old], (config.detect, config.hull))
     return Stage(scene, old, past, capture, frames)

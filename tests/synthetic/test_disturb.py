@@ -9,10 +9,10 @@ from refield.scene.capture import Capture, Frame
 from refield.scene.errors import InputError
 from refield.scene.images import frame_image, write_image
 from refield.scene.pose import angle_between, invert
+from refield.scene.srgb import to_linear
 from refield.scene.transforms_json import load_transforms, save_transforms
 from refield.synthetic.cameras import ring, square_camera
 from refield.synthetic.disturb import Disturbance, displacement, disturbed, disturbed_photo, disturbed_pose, gains
-from refield.synthetic.textures import to_linear
 
 TARGET = (0.0, 0.0, 0.15)
 DISTANCE = 2.1

@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from refield.scene.camera import Camera
+from refield.scene.srgb import to_linear
 from refield.synthetic.cameras import hemisphere
 from refield.synthetic.insert import Shot, inserted, seen_in
 from refield.synthetic.looks import Look, blur_of, gain_of, noise_of
 from refield.synthetic.placing import box_item
 from refield.synthetic.shading import CastShadow, Light
 from refield.synthetic.state import Item, State
-from refield.synthetic.textures import to_linear
 from refield.synthetic.visibility import silhouette
 
 UP = torch.tensor([0.0, 0, 1], dtype=torch.float64)

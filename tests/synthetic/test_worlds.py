@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from refield.scene.pose import angle_between, invert, transform
+from refield.scene.srgb import to_linear, to_srgb
 from refield.synthetic.cameras import HEIGHTS, RADIUS, hemisphere, ring, square_camera
 from refield.synthetic.paper_worlds import PAPER_MOVE
 from refield.synthetic.placing import FLOOR_HALF
 from refield.synthetic.shapes import Box, Cone, Cylinder, Sphere
-from refield.synthetic.textures import to_linear, to_srgb
 from refield.synthetic.visibility import view_hits
 from refield.synthetic.worlds import WORLDS
 

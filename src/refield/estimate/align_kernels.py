@@ -229,7 +229,11 @@ def _score(
     radius: float,
     block: int,
 ) -> float:
-    """Mean capped colour error of the visible points plus the part of the target pixels that stay uncovered."""
+    """Mean capped colour error of the points that face the views plus the part of the target that stays uncovered.
+
+    A point that something hides, or that lies beyond the photo, speaks neither for the pose nor against it: it counts
+    half. Else a pose of which next to nothing can be seen would be as good as any.
+    """
     gains = _gains(points, sides, colours, lenses, images, depths, r, c, radius)
     error, total, uncovered, wanted = 0.0, 0.0, 0.0, 0.0
     p, at, px = np.zeros(9), np.zeros(6), np.zeros(9)
@@ -239,13 +243,18 @@ def _score(
         for n in range(points.shape[0]):
             _place(points, n, r, c, p)
             cosine, distance = _facing(lens, p)
-            if cosine < 0.1 or not _project(lens, p[0], p[1], p[2], at):
+            if cosine < 0.1:
                 continue
+            shown = _project(lens, p[0], p[1], p[2], at)
             i, j = int(at[1]), int(at[0])
-            covered[i // block, j // block] = 1
-            if cosine < 0.2 or distance > depths[v, i, j] + 0.3 * radius:
+            if shown:
+                covered[i // block, j // block] = 1
+            if cosine < 0.2:
                 continue
             total += cosine
+            if not shown or distance > depths[v, i, j] + 0.3 * radius:
+                error += 0.5 * cosine
+                continue
             if targets[v, i, j] < 0:  # certainly unchanged: nothing can be in front here
                 error += cosine
                 continue

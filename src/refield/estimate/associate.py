@@ -6,7 +6,7 @@ next is looked for. So two newcomers whose hulls run together are told apart by 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 
@@ -60,7 +60,7 @@ class AssociateConfig:
     """by how much more than the old rendering did"""
     alike: float = 0.5
     """part of the pixels at its new place that look as before; if it is more, it must gain twice as much"""
-    refined: int = 2
+    refined: int = 6
     """candidates of an object that are refined"""
     gone: float = 0.45
     """part of an object's pixels that must show what was behind it, for it to have left"""
@@ -136,17 +136,14 @@ class Fit:
 def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> Settled:
     """Find each old object's new place or that it left, and what else arrived."""
     touched = [k for k, old in enumerate(olds) if changed_share(changed, old) >= ground.believe.touched]
-    views = look_past(ground.field, changed, ground.memory, [olds[k] for k in touched], (ground.detect, ground.carving))
-    moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, views)
+    moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, changed)
     trimmed_some = any(placed[k] is not olds[k] for k in touched)
     olds = [placed.get(k, old) for k, old in enumerate(olds)]
     shares = {k: _gone(ground, views, olds[k]) for k in touched if k not in moved}
     removed = {k: share for k, share in shares.items() if share is not None}
     kept = [k for k in touched if k in moved or k in removed]
     if len(kept) < len(touched) or trimmed_some:  # what never left hides what is behind it after all
-        views = look_past(
-            ground.field, changed, ground.memory, [olds[k] for k in kept], (ground.detect, ground.carving)
-        )
+        views = _without(ground, changed, [olds[k] for k in kept])
         for k, change in moved.items():
             views = take_off(ground.field, views, olds[k], change)
     gone = [olds[k] for k in kept]
@@ -182,8 +179,11 @@ def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
     """Whether an object's pixels changed and show what was behind it."""
     if changed_share(changed, old) < ground.believe.touched:
         return False
-    views = look_past(ground.field, changed, ground.memory, [old], (ground.detect, ground.carving))
-    return _gone(ground, views, old) is not None
+    return _gone(ground, _without(ground, changed, [old]), old) is not None
+
+
+def _without(ground: Ground, changed: Sequence[Changed], olds: Sequence[Old]) -> list[Past]:
+    return look_past(ground.field, changed, ground.memory, olds, (ground.detect, ground.carving))
 
 
 def _gone(ground: Ground, views: Sequence[Past], old: Old) -> float | None:
@@ -193,11 +193,30 @@ def _gone(ground: Ground, views: Sequence[Past], old: Old) -> float | None:
 
 
 def _place_all(
-    ground: Ground, olds: dict[int, Old], views: list[Past]
+    ground: Ground, olds: dict[int, Old], changed: Sequence[Changed]
 ) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:
-    """Place the old objects that fit somewhere, the best first, taking each off the photos."""
+    """Place the old objects that fit somewhere, in the photos without those that certainly left, then without all.
+
+    What a newcomer hides may look like a thing that changed; where that is taken out, nobody knows what is behind, and
+    the newcomer is not looked for.
+    """
+    sure = [k for k, old in olds.items() if looks_gone(ground, changed, old)]
     moved: dict[int, PoseChange] = {}
-    tried = list(olds.items())[: ground.believe.most]
+    for out in [sure, list(olds)] if 0 < len(sure) < len(olds) else [list(olds)]:
+        views = _without(ground, changed, [olds[k] for k in out])
+        for k, change in moved.items():
+            views = take_off(ground.field, views, olds[k], change)
+        more, views, placed = _place(ground, {k: olds[k] for k in out}, moved, views)
+        moved, olds = moved | more, olds | placed
+    return moved, views, olds
+
+
+def _place(
+    ground: Ground, olds: dict[int, Old], before: Mapping[int, PoseChange], views: list[Past]
+) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:
+    """Place objects that ``views`` are without and that were not placed ``before``, the best first, taking each off."""
+    moved: dict[int, PoseChange] = {}
+    tried = [item for item in olds.items() if item[0] not in before][: ground.believe.most]
     everyone, asked = list(olds.values()), views
     guess = cache(lambda k: matched_poses(olds[k], asked, ground.survey, ground.matcher))
     while True:
@@ -206,7 +225,7 @@ def _place_all(
         # what moved before moves again: a piece of something else is tried only on what that leaves unexplained
         for again in (True, False):
             some = [k for k, old in tried if old.remembered == again and k not in moved and parts]
-            tries = {k: best_fit(ground, olds[k], everyone, views, parts, guess(k)) for k in some}
+            tries = {k: _best_of(ground, olds[k], everyone, views, parts, guess(k)) for k in some}
             fits |= {k: fit for k, fit in tries.items() if fit is not None}
             if any(fit.change.explained >= ground.believe.shown for fit in fits.values()):
                 break
@@ -296,7 +315,7 @@ def _only_light(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
     alike, shown = 0, 0
     for p in past:
         here = shadow_of(p.view, ground.hull.lattice, part) & p.open
-        alike += int((here & even_and_grey(log_ratio(p.view, p.rgb, ground.detect), ground.detect)).sum())
+        alike += int((here & even_and_grey(log_ratio(p.view, p.rgb, ground.detect))).sum())
         shown += int(here.sum())
     return alike > 0.5 * shown
 
@@ -351,6 +370,19 @@ def _places_in(lattice: Lattice, inner: Array, old: Old) -> Array:
         chosen.append(int(nearest.argmax()))
         nearest = np.minimum(nearest, np.linalg.norm(at - at[chosen[-1]], axis=-1))
     return at[chosen].astype(np.float32)
+
+
+def _best_of(
+    ground: Ground,
+    old: Old,
+    olds: Sequence[Old],
+    past: Sequence[Past],
+    parts: Sequence[Voxels],
+    extra: Sequence[Tensor],
+) -> Fit | None:
+    """The better fit of the outlines that an object may have."""
+    fits = [best_fit(ground, o, olds, past, parts, extra) for o in (old, old.instead) if o is not None]
+    return max((f for f in fits if f is not None), key=lambda f: f.change.explained, default=None)
 
 
 def best_fit(

@@ -44,10 +44,6 @@ class DetectConfig:
     """seeds of a change exceed this part of Otsu's level"""
     smallest: float = 0.0006
     """of the image's pixels; smaller spots are dropped"""
-    grey: float = 0.10
-    """a light change multiplies all channels by the same factor, up to this in log units"""
-    largest_ratio: float = 5.0
-    """light changes by no more than this factor"""
 
 
 @dataclass(frozen=True)

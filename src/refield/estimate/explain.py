@@ -9,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from refield.estimate.light import DARK, LARGEST, tint
 from refield.estimate.look import Array
+from refield.scene.srgb import to_linear, to_srgb
 from refield.vision import pixels
 
 _LIMIT = 1.5  # times the difference from which on a pixel counts as changed
 _FEWEST = 50  # pixels from which a share is told
-_LIGHT = 2.5  # times brighter or darker a side may be where the object is now
 
 
 @dataclass(frozen=True)
@@ -76,12 +77,16 @@ def explained_before(pictures: Sequence[tuple[Array, Array, NDArray[np.bool_]]],
 
 
 def _relit(p: Compared, sigma: float) -> Array:
-    """The composite with each side's smooth brightness taken from the photo: what turned is lit anew."""
-    gain = np.ones((*p.sides.shape, 1), np.float32)
-    seen, shown = p.photo.mean(-1), p.composite.mean(-1)
+    """The composite with each side's smooth light taken from the photo: what turned is lit anew."""
+    seen, shown = to_linear(p.photo), to_linear(np.maximum(p.composite, 0))
+    ratio = np.zeros_like(shown)
     for side in range(int(p.sides.max(initial=-1)) + 1):
         here = p.sides == side
-        weight = here.astype(np.float32)
-        light = pixels.blur(seen * weight, sigma) / np.maximum(pixels.blur(shown * weight, sigma), 1e-4)
-        gain[here] = np.clip(light[here], 1 / _LIGHT, _LIGHT)[:, None]
-    return p.composite * gain
+        weight = here[..., None].astype(np.float32)
+        dark = DARK / 3 * pixels.blur(weight, sigma)[..., None] + 1e-6
+        over, under = (pixels.blur(light * weight, sigma) + dark for light in (seen, shown))
+        ratio[here] = np.log(over / under)[here]
+    mean = ratio.mean(-1, keepdims=True)
+    most = np.log(LARGEST)
+    gain = np.clip(mean, -most, most) + np.clip(ratio - mean, -tint(mean), tint(mean))
+    return to_srgb(shown * np.exp(gain))

@@ -15,9 +15,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from refield.estimate.detect import Changed, Mask
-from refield.estimate.hull import Hull
+from refield.estimate.hull import Hull, HullConfig, votes
 from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.look import Array, View
+from refield.vision import pixels
 from refield.vision.segmenter import Segmenter, cut_out
 
 _JUMP = 5.0  # pixels' widths; a surface that is fitted well bends by less from one pixel to the next
@@ -25,11 +26,12 @@ _SHARED = 0.3  # of the smaller of two faces' voxels, for them to be one
 
 
 def changed_parts(
-    changed: Sequence[Changed], carved: Hull, free: Voxels, smallest: int, segmenter: Segmenter
-) -> tuple[list[Voxels], list[Voxels]]:
-    """Solid parts of the change hull, the largest first: those that look like things, and the others.
+    changed: Sequence[Changed], carved: Hull, free: Voxels, config: HullConfig, segmenter: Segmenter
+) -> tuple[list[Voxels], list[Voxels], Voxels]:
+    """Solid parts of the change hull, the largest first: those that look like things, and the others; and the voxels
+    that most views show a thing at, or behind it.
 
-    Each has one surface and reaches no deeper behind it than that is wide. ``free``: voxels in front of what holds
+    Each part has one surface and reaches no deeper behind it than that is wide. ``free``: voxels in front of what holds
     things up.
     """
     lattice = carved.lattice
@@ -39,7 +41,7 @@ def changed_parts(
     behind = _joined([f for c, t in zip(changed, marked) for f in _faces_in(c.view, c.mask & ~t, lattice, solid)])
     faces = own + behind
     if not faces:
-        return [], []
+        return [], [], np.zeros(lattice.shape, bool)
     label = np.zeros(lattice.shape, np.int32)
     for k, face in enumerate(faces, start=1):
         label[face & (label == 0)] = k
@@ -52,9 +54,12 @@ def changed_parts(
         at = lattice.centres[face]
         width = float((at.max(0) - at.min(0)).max()) + lattice.cell
         mine = solid & (label == k) & (carved.behind < width)
-        parts = [p for p in components(mine, smallest) if (p & face).any()]
+        parts = [p for p in components(mine, config.smallest) if (p & face).any()]
         (things if k <= len(own) else others).extend(parts)
-    return sorted(things, key=np.sum, reverse=True), sorted(others, key=np.sum, reverse=True)
+    shown = [(c.witness(), pixels.dilate(c.mask & t, config.margin)) for c, t in zip(changed, marked)]
+    inside, against = votes(lattice.centres.reshape(-1, 3), shown, config)
+    own_places = ((against == 0) & (2 * inside > len(shown))).reshape(lattice.shape)
+    return sorted(things, key=np.sum, reverse=True), sorted(others, key=np.sum, reverse=True), own_places
 
 
 def _things_in(c: Changed, segmenter: Segmenter) -> Mask:

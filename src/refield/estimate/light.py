@@ -15,9 +15,15 @@ import numpy as np
 from refield.estimate.detect import Changed, DetectConfig, Mask, blur_sigma
 from refield.estimate.look import Array, View
 from refield.scene.planes import Plane
+from refield.scene.srgb import to_linear
 from refield.vision import pixels
 
-_DARK = 0.03  # linear light; below it a ratio is noise
+DARK = 0.03
+"""linear light, summed over the channels; below it a ratio is noise"""
+LARGEST = 5.0
+"""times that light makes a surface brighter or darker, at most"""
+_GREY = 0.10  # log units by which light changes one channel more than another, however bright it is
+_TINT = 0.5  # and of how much brighter or darker it makes them: half of what leaves one channel as it was
 _AGREE = 0.12  # log units between two views' ratios of the same surface point
 _SAME_PLACE = 0.02  # of the distance
 
@@ -33,7 +39,7 @@ def set_light_aside(changed: Sequence[Changed], planes: Sequence[Plane], config:
     for i, c in enumerate(changed):
         agrees, denies, asked = _agreement(i, changed, ratios)
         flat = _on_planes(c.view, planes) & (denies == 0) & (agrees >= 1)
-        light = c.mask & even_and_grey(ratios[i], config) & (flat | (agrees >= np.maximum(2, 0.6 * asked)))
+        light = c.mask & even_and_grey(ratios[i]) & (flat | (agrees >= np.maximum(2, 0.6 * asked)))
         light = cv2.medianBlur(light.astype(np.uint8), 5).astype(bool) & c.mask
         smallest = max(6, config.smallest * light.size)
         rest = c.mask & ~pixels.keep_components(light, 2 * smallest)
@@ -56,21 +62,22 @@ def _on_planes(view: View, planes: Sequence[Plane]) -> Mask:
 def log_ratio(view: View, rgb: Array, config: DetectConfig) -> Array:
     """log(photo / rgb) per channel in linear light, (H, W, 3); ``rgb`` is what the field shows, (H, W, 3)."""
     sigma = blur_sigma(view, config)
-    photo, shown = (pixels.blur(_linear(im), sigma) for im in (view.photo, rgb))
-    return np.log((photo + _DARK / 3) / (shown + _DARK / 3)).astype(np.float32)
+    photo, shown = (pixels.blur(to_linear(im), sigma) for im in (view.photo, rgb))
+    return np.log((photo + DARK / 3) / (shown + DARK / 3)).astype(np.float32)
 
 
-def _linear(image: Array) -> Array:
-    return np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def even_and_grey(ratio: Array, config: DetectConfig) -> Mask:
+def even_and_grey(ratio: Array) -> Mask:
     """Pixels whose ratio (H, W, 3) is near grey, much the same around, and within reason."""
     mean = ratio.mean(-1)
     chroma = np.abs(ratio - mean[..., None]).max(-1)
     spread = cv2.blur(mean**2, (3, 3)) - cv2.blur(mean, (3, 3)) ** 2
     even = np.sqrt(np.maximum(spread, 0)) < 0.15
-    return even & (chroma < config.grey + 0.15 * np.abs(mean)) & (np.abs(mean) < np.log(config.largest_ratio))
+    return even & (chroma < tint(mean)) & (np.abs(mean) < np.log(LARGEST))
+
+
+def tint(mean: Array) -> Array:
+    """How far, in log units, light that makes a surface brighter by exp(``mean``) changes a channel beyond that."""
+    return _GREY + _TINT * np.abs(mean)
 
 
 def _agreement(i: int, changed: Sequence[Changed], ratios: Sequence[Array]) -> tuple[Array, Array, Array]:

@@ -103,6 +103,8 @@ class Old:
     """its shape is that of an earlier visit; ``patches`` are of some old views only"""
     source: Source | None = None
     """where it is looked up, if not where it was"""
+    instead: Old | None = None
+    """what it may be with its surroundings, where it cannot be told from them; what fits the new photos says which"""
 
     @property
     def centre(self) -> Array:

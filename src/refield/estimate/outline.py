@@ -62,6 +62,8 @@ class Seeds:
     """in the change hull: it may be part of it"""
     unchanged: Voxels
     """some new view shows it as it was: hardly part of it"""
+    own: Voxels
+    """most new views show it, or what is before it, as a thing: what is changed elsewhere may be its surroundings"""
 
 
 def outline(
@@ -88,17 +90,22 @@ def outline(
     solid = carve_solid(lattice, patches, config.through, float((places.max(0) - places.min(0)).max()))
     free = _free(lattice, planes)
     voxels, stands_free = _connected(lattice, solid & free, seeds, config)
+    inner = None
     if voxels.any() and not stands_free:
+        core = seeds.changed & seeds.own
+        if FEWEST_POINTS <= core.sum() < seeds.changed.sum():
+            inner = outline(field, frames, replace(seeds, changed=core), planes, segmenter, config)
         cut = _cut_out(lattice, voxels, patches, segmenter, config)
         if cut.sum() < _FOUND * voxels.sum():  # where colours are much alike, a segmenter may find nothing of it
             sure = components(voxels & seeds.lattice.holds(grown(seeds.changed, 1), lattice.centres), 30)
             cut = sure[0] if sure else cut
         voxels = cut
     if not voxels.any():
-        return None
+        return inner
     voxels = ndimage.binary_fill_holes(voxels)
     cloud = surface_cloud(lattice, voxels, patches, config.points)
-    return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= FEWEST_POINTS else None
+    old = Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= FEWEST_POINTS else None
+    return old if inner is None else replace(inner, instead=old)
 
 
 def remembered(

@@ -132,8 +132,8 @@ def estimate_change(
         answer = disagreeing(scene.changed, photos, scene.errors)
         return replace(answer, why=answer.why + beside)
     carved, free = _carved(scene, region)
-    things, others = changed_parts(scene.changed, carved, free, config.hull.smallest, models.segmenter)
-    olds = _were_there(scene, carved, things or others)
+    things, others, own = changed_parts(scene.changed, carved, free, config.hull, models.segmenter)
+    olds = _were_there(scene, (carved, own), things or others)
     say("pose")
     up = scene.planes[0].normal if scene.planes else _up(capture)
     photographed = [f for f in capture.frames if f.made is None]
@@ -142,7 +142,7 @@ def estimate_change(
         config.detect, config.hull, config.objects, config.associate, config.register, config.refine, models.matcher,
     )  # fmt: skip
     settled = associate.settle(ground, olds, scene.changed)
-    more = _overlooked(scene, ground, settled, (things, others), olds) if things else []
+    more = _overlooked(scene, ground, settled, (things, others, own), olds) if things else []
     if more:
         settled = associate.settle(ground, _whole([*olds, *more]), scene.changed)
     say("segment")
@@ -233,10 +233,15 @@ def _carved(scene: _Scene, region: Lattice) -> tuple[Hull, Voxels]:
     return carved, free
 
 
-def _were_there(scene: _Scene, carved: Hull, parts: Sequence[Voxels], known: Sequence[Old] = ()) -> list[Old]:
-    """Whole objects of the old field that parts of the change hull belong to, but for those already known."""
+def _were_there(
+    scene: _Scene, hull: tuple[Hull, Voxels], parts: Sequence[Voxels], known: Sequence[Old] = ()
+) -> list[Old]:
+    """Whole objects of the old field that parts of the change hull belong to, but for those already known.
+
+    ``hull``: with the voxels where most new views show a thing.
+    """
     found: list[Old] = []
-    config = scene.config
+    (carved, own), config = hull, scene.config
     for part in parts[: config.associate.most]:
         at = carved.lattice.centres[part]
         if any(old.lattice.holds(grown(old.voxels, old.margin), at).mean() > 0.5 for old in (*known, *found)):
@@ -247,7 +252,7 @@ def _were_there(scene: _Scene, carved: Hull, parts: Sequence[Voxels], known: Seq
             if old is not None:
                 found.append(old)
                 continue
-        seeds = Seeds(carved.lattice, part, carved.hull, carved.unchanged)
+        seeds = Seeds(carved.lattice, part, carved.hull, carved.unchanged, own)
         old = outline(scene.field, scene.capture.train, seeds, scene.planes, scene.models.segmenter, config.objects)
         if old is not None:
             found.append(old)
@@ -264,20 +269,24 @@ def _whole(olds: list[Old]) -> list[Old]:
 
 
 def _overlooked(
-    scene: _Scene, ground: Ground, settled: Settled, parts: tuple[list[Voxels], list[Voxels]], known: list[Old]
+    scene: _Scene,
+    ground: Ground,
+    settled: Settled,
+    parts: tuple[list[Voxels], list[Voxels], Voxels],
+    known: list[Old],
 ) -> list[Old]:
     """Objects that look like what a newcomer hides, since they go on outside of the changed pixels, and yet left.
 
     What they would explain is explained by nothing else, or the photos show what was behind them. Crumbs are none,
     unless an earlier visit knows them.
     """
-    things, others = parts
+    things, others, _ = parts
     least = 0.15 * max(float(p.sum()) for p in (*things, *others))
     more: list[Old] = []
     for part in others:
         needed = unexplained(ground, settled, part)
         if needed or part.sum() >= least:
-            found = _were_there(scene, ground.hull, [part], [*known, *more])
+            found = _were_there(scene, (ground.hull, part), [part], [*known, *more])
             found = [o for o in found if o.remembered or not is_crumb(scene.changed, o, ground.believe.crumb)]
             more += [old for old in found if needed or looks_gone(ground, scene.changed, old)]
     return more

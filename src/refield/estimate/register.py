@@ -44,8 +44,6 @@ class RegisterConfig:
     """of the object's apparent diameter"""
     enough: float = 0.2
     """a score that turns about the support's normal, or a guess, reach; then no other rotation is tried"""
-    plausible: float = 0.5
-    """the same where the object may be in many places, each of which costs"""
     cap: float = 0.25
     """colour distance (in [0, 1] RGB) at which a point counts as wrong"""
 
@@ -162,7 +160,7 @@ def register(
         likely = np.concatenate([likely, guess[:3, :3].numpy()[None]])
         centres = np.concatenate([centres, (guess[:3, :3].numpy() @ middle + guess[:3, 3].numpy())[None]])
     found = search.best(likely, centres)
-    if found[0].score > (config.enough if len(places) == 1 else config.plausible):
+    if found[0].score > config.enough:
         every = super_fibonacci(config.rotations)
         best = transform(found[0].new_from_old, torch.from_numpy(middle).double()).numpy()
         start = places[np.linalg.norm(places - best, axis=-1).argmin()]

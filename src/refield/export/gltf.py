@@ -20,6 +20,7 @@ from torch import Tensor
 from refield import __version__
 from refield.scene.camera import Camera
 from refield.scene.pose import exp, rotation_log
+from refield.scene.srgb import to_linear
 from refield.scene.world import World
 
 ROOT = "upright_from_world"
@@ -161,6 +162,6 @@ def quaternion(rotation: Tensor) -> list[float]:
 
 def _linear(rgb: NDArray[np.float32]) -> NDArray[np.uint16]:
     """sRGB (P, 3) in [0, 1] as linear light (P, 4) with full opacity, 16 bits: glTF's vertex colours are linear."""
-    light = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    light = to_linear(rgb)
     opaque = np.ones((len(rgb), 1), light.dtype)
     return np.rint(np.concatenate([light, opaque], 1).clip(0, 1) * 65535).astype("<u2")

@@ -14,12 +14,12 @@ from torch import Tensor
 from refield.rehearse.spots import Site, is_free, pose_at, upright
 from refield.scene.errors import InputError
 from refield.scene.pose import exp
+from refield.scene.srgb import to_linear
 from refield.synthetic.random_objects import drawn_item
 from refield.synthetic.random_textures import Pattern
 from refield.synthetic.shading import Light
 from refield.synthetic.shapes import Solid
 from refield.synthetic.state import Item, State, World
-from refield.synthetic.textures import to_linear
 
 HAPPENINGS = ("moved", "added", "removed", "several", "turned", "tipped", "nothing")
 """what seed N does is the N-th of these, round and round"""

@@ -22,9 +22,10 @@ from refield.scene.errors import InputError
 from refield.scene.images import frame_image, write_image
 from refield.scene.load import load_capture
 from refield.scene.pose import exp, invert, transform
+from refield.scene.srgb import to_linear, to_srgb
 from refield.scene.transforms_json import NAME, save_transforms
 from refield.synthetic.state import Triple
-from refield.synthetic.textures import blurred, to_linear, to_srgb
+from refield.synthetic.textures import blurred
 
 _MID_GREY = 0.214  # linear; 0.5 on the sRGB curve
 _SHOT = 0.95  # part of the noise's variance at mid grey that grows with the light; the rest is read noise

@@ -18,10 +18,10 @@ from torch import Tensor
 from refield.scene.camera import Camera
 from refield.scene.capture import camera_rays
 from refield.scene.pose import invert, transform
+from refield.scene.srgb import to_linear, to_srgb
 from refield.synthetic.looks import Look
 from refield.synthetic.shading import Light, shaded
 from refield.synthetic.state import State
-from refield.synthetic.textures import to_linear, to_srgb
 from refield.synthetic.visibility import Hits, first_hits
 
 Window = tuple[slice, slice]

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refield.synthetic.textures import to_linear
+from refield.scene.srgb import to_linear
 
 _EDGES = 0.005  # of the pixels, those with the steepest brightness, tell the blur
 _SHARPEST = 20  # per cent of them that count: the others are edges of soft things

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from refield.scene.camera import Camera
 from refield.scene.errors import InputError
+from refield.scene.srgb import to_linear, to_srgb
 from refield.synthetic.state import Item, Lamp, State
-from refield.synthetic.textures import to_linear, to_srgb
 
 _SEEDS = 2**32  # that the renderer knows
 _OLDEST_LLVM = 19  # an older one aborts the whole process on the first kernel

@@ -20,12 +20,12 @@ from refield.scene.capture import Capture, Frame
 from refield.scene.change_files import save_change
 from refield.scene.files import write_json
 from refield.scene.images import frame_image, write_image
+from refield.scene.srgb import to_linear, to_srgb
 from refield.scene.transforms_json import NAME, save_transforms
 from refield.synthetic.disturb import Disturbance, disturbed_photo, disturbed_pose
 from refield.synthetic.pathtrace import PathTracer, mitsuba
 from refield.synthetic.random_worlds import RandomWorld, random_world
 from refield.synthetic.state import State
-from refield.synthetic.textures import to_linear, to_srgb
 from refield.synthetic.write import Progress, SynthConfig, shoot_state, true_change, write_masks
 
 _METERED, _METER_PIXELS, _METER_PATHS = 6, 32, 64  # photos that the exposure is metered on, their size, their paths

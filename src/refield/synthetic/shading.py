@@ -13,9 +13,9 @@ from torch import Tensor
 
 from refield.scene.capture import Rays
 from refield.scene.pose import invert, rotate, transform
+from refield.scene.srgb import to_linear
 from refield.synthetic.oracles import looked_up
 from refield.synthetic.state import Item, State
-from refield.synthetic.textures import to_linear
 from refield.synthetic.visibility import first_hits
 
 _GROUND = 0.3  # of the light on a level surface comes back from it: a usual albedo

@@ -193,14 +193,3 @@ def surroundings(rng: np.random.Generator, sun: float, height: int = 256) -> Ima
     cosine = np.sin(elevation) * np.sin(high) + np.cos(elevation) * np.cos(high) * np.cos(azimuth - side)
     glow = sun * np.exp((cosine - 1) / (2 * 0.09**2))[..., None] * np.array([1.0, 0.93, 0.82])
     return (1.3 * (np.clip(out, 0.02, None) + glow)).astype(np.float32)
-
-
-def to_linear(srgb: Image) -> Image:
-    """sRGB curve → linear light."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def to_srgb(linear: Image) -> Image:
-    """Linear light → sRGB curve, clipped to [0, 1]."""
-    x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055).astype(np.float32)
