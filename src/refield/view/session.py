@@ -36,7 +36,8 @@ class Session:
         self.client, self.scenery = client, scenery
         self._lock = threading.RLock()
         self._visit = scenery.latest
-        self._standing = StandingView(self._state, self._show_picture, scenery.turns)
+        self._standing = StandingView(self._state, self._show_picture, scenery.turns, self._rested)
+        self._due = True  # the state that is shown has yet to be drawn
         self._sharp, self._closed = True, False  # until the first picture is there nothing else need be drawn
         self._waits_until = time.monotonic() + _FIRST
         self._photos: str | None = None
@@ -71,8 +72,10 @@ class Session:
     def show(self, visit: int) -> None:
         """Another state: its splats, else its points until they are ready; what changed; photos."""
         with self._lock:
-            self._visit = visit
-            self._draw_state()
+            self._visit, self._due = visit, True
+            if not self._sharp:
+                self._draw_state()
+            self.panel.preparing(self.scenery.splats(visit) is None)
             self._draw_marks()
             self._photos = None
             self._draw_photos()
@@ -99,6 +102,7 @@ class Session:
         return self.scenery.field(visit)
 
     def _draw_state(self) -> None:
+        self._due = False
         splats = self.scenery.splats(self._visit)
         with self.client.atomic():
             if splats is not None:
@@ -208,10 +212,18 @@ class Session:
             self._sharp, self._waits_until = True, 0.0
             self._hide_state(True)
 
+    def _rested(self) -> None:
+        """Our own picture is there: time to draw the state behind it, for when the camera moves."""
+        with self._lock:
+            if self._due and not self._closed:
+                self._draw_state()
+
     def _unsharpen(self) -> None:
         with self._lock:
             if self._sharp and time.monotonic() > self._waits_until:
                 self._sharp = False
+                if self._due:
+                    self._draw_state()
                 with self.client.atomic():
                     self._hide_state(False)
                     self.client.scene.set_background_image(None)

@@ -78,6 +78,8 @@ class StandingView:
     state: Callable[[int], Field]
     show: Callable[[Picture], None]
     turns: Turns
+    rested: Callable[[], None] = lambda: None
+    """hears that a picture is as fine as it gets"""
     _wanted: Looking | None = None
     _count: int = 0
     """of requests; whoever works for an earlier one stops"""
@@ -145,6 +147,7 @@ class StandingView:
                 return
             self.show(composed(wanted, camera, [self._kept[n, part] for n in wanted.states]))
         self._shown = request
+        self.rested()
 
     def _seen(self, number: int, camera: Camera, world_from_cam: Tensor, request: int) -> Rendering | None:
         """A state's rendering; None if something else was asked for meanwhile."""
