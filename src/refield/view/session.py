@@ -46,10 +46,9 @@ class Session:
 
     def open(self) -> None:
         """Show the latest state."""
-        look, camera = (
-            first_look(self.scenery.stage, self.scenery.capture.frames, self.scenery.world),
-            self.client.camera,
-        )
+        scenery, camera = self.scenery, self.client.camera
+        aspect = camera.image_width / max(camera.image_height, 1)
+        look = first_look(scenery.stage, scenery.capture.frames, scenery.world, aspect)
         with self.client.atomic():
             camera.up_direction, camera.fov = look.up, look.fov
             camera.position, camera.look_at = look.position, look.look_at

@@ -91,12 +91,13 @@ class Look:
     """from the upper to the lower edge, radians"""
 
 
-def first_look(stage: Stage, frames: Sequence[Frame], world: World) -> Look:
-    """Where a photographer stood, rather above the others, with what they look at before the eye."""
+def first_look(stage: Stage, frames: Sequence[Frame], world: World, aspect: float = 1.0) -> Look:
+    """Where a photographer stood, rather above the others, with what they look at before the eye; farther off on
+    screens that are higher than wide (``aspect``: width over height)."""
     heights = centres(frames) @ torch.tensor(world.up, dtype=torch.float64)
     frame = frames[int((heights - heights.quantile(0.6)).abs().argmin())]
     ahead = float(transform(invert(frame.world_from_cam), stage.middle)[2]) > 0
     target = stage.middle if ahead else frame.centre + frame.world_from_cam[:3, 2] / stage.scale
     fov = 2 * math.atan(frame.camera.height / 2 / frame.camera.fy)
-    back = target + _BACK * (frame.centre - target)
+    back = target + _BACK / min(max(aspect, 0.5), 1.0) * (frame.centre - target)
     return Look(stage.point(back), stage.point(target), world.up, fov)
