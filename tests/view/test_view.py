@@ -3,6 +3,7 @@
 import math
 import shutil
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from refield.field.volrend import Rendering
 from refield.scene.camera import Camera
 from refield.scene.pose import exp, transform
 from refield.view.draw import covariances
-from refield.view.marks import IS, WAS, places_of
+from refield.view.marks import IS, WAS, pictured, places_of, shots_of
 from refield.view.scenery import Scenery
 from refield.view.stage import first_look
 from refield.view.standing import Looking, StandingView, composed
@@ -74,6 +75,20 @@ def test_boxes_stand_where_things_were_and_are(scenery):
         assert torch.cdist(corners(BOX).double(), places[key].box.corners).amin(1).max() < 3 * CELL
     there = transform(NEW_FROM_OLD, places[1, False].box.corners)
     assert torch.allclose(there, places[1, True].box.corners, atol=1e-6)
+
+
+def test_photos_are_drawn_small_with_their_masks(scenery):
+    change = scenery.changes[0]
+    height, width = change.frames[0].camera.height, change.frames[0].camera.width
+    left = torch.zeros(height, width, dtype=torch.bool)
+    left[:, : width // 2] = True
+    told = replace(change, masks_in=(left, left), masks_out=())
+    shots = shots_of(scenery.capture.frames[:3], told)
+    assert [s.name for s in shots] == ["old_0", "old_1", "old_2", "new_0", "new_1"]
+    plain, inked = (pictured(shots_of((), c)[0]).picture.astype(float) for c in (change, told))
+    assert plain.shape == (height, width, 3) and (plain[:, -9:] == inked[:, -9:]).all()
+    part = 140 / 255
+    assert np.abs(inked[9:-9, 5:20] - (part * np.array(IS) + (1 - part) * plain[9:-9, 5:20])).max() < 3
 
 
 def flat(depth, red, camera):

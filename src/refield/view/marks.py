@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from refield.report.words import up_of
@@ -20,6 +21,7 @@ from refield.scene.boxes import UprightBox, upright_box
 from refield.scene.capture import Frame
 from refield.scene.change import ObjectChange, SceneChange
 from refield.scene.images import frame_image
+from refield.scene.notebook import inked
 from refield.scene.world import World
 from refield.view.stage import Array, Stage
 
@@ -108,17 +110,24 @@ class Shot:
     new: bool
     picture: NDPicture | None = None
     """what it shows, (h, w, 3) uint8"""
+    masks: tuple[tuple[Tensor, tuple[int, int, int]], ...] = ()
+    """(H, W) bool each, to be laid over it in a colour"""
 
 
 NDPicture = np.ndarray[Any, np.dtype[np.uint8]]
 
 
-def shots_of(old: Sequence[Frame], new: Sequence[Frame]) -> list[Shot]:
-    """The photos of a state, still without pictures: some of the old ones, and all of those that a visit brought."""
+def shots_of(old: Sequence[Frame], change: SceneChange | None) -> list[Shot]:
+    """The photos of a state, still without pictures: some of the old ones, and all of those that a visit brought, with
+    those of its masks that were read."""
     from refield.estimate.look import spread_out
 
     few = [Shot(f"old_{i}", f, False) for i, f in enumerate(spread_out(old, _MOST_OLD))]
-    return few + [Shot(f"new_{i}", f, True) for i, f in enumerate(new)]
+    if change is None:
+        return few
+    kinds = ((change.masks_out, WAS), (change.masks_in, IS), (change.unexplained, _NEW))
+    masks = [tuple((kind[i], ink) for kind, ink in kinds if kind) for i in range(len(change.frames))]
+    return few + [Shot(f"new_{i}", f, True, masks=m) for i, (f, m) in enumerate(zip(change.frames, masks))]
 
 
 def pictured(shot: Shot) -> Shot:
@@ -130,7 +139,8 @@ def pictured(shot: Shot) -> Shot:
     image = frame_image(shot.frame).numpy()
     part = min(1.0, _THUMBNAIL[shot.new] / max(image.shape[:2]))
     size = max(round(image.shape[1] * part), 1), max(round(image.shape[0] * part), 1)
-    return replace(shot, picture=np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8))
+    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return replace(shot, picture=np.asarray(inked(Image.fromarray(small), shot.masks)))
 
 
 def draw_shot(

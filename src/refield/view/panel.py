@@ -14,14 +14,14 @@ from refield.view.told import told
 if TYPE_CHECKING:
     from viser import GuiApi
 
-Photos = Literal["none", "new", "all"]
+Photos = Literal["none", "new", "marked", "all"]
 _LAYERS: dict[str, Layer | Literal["splats"]] = {
     "sharp when still": "sharp",
     "splats only": "splats",
     "depth": "depth",
     "what changed": "changed",
 }
-_PHOTOS: dict[str, Photos] = {"of this visit": "new", "all": "all", "none": "none"}
+_PHOTOS: dict[str, Photos] = {"of this visit": "new", "with masks": "marked", "all": "all", "none": "none"}
 OnChange = Callable[[str], None]
 
 

@@ -75,6 +75,14 @@ class Scenery:
         """Photos from whose places a state is looked at."""
         return (*self.capture.frames, *(f for change in self.changes[:visit] for f in change.frames))
 
+    def marked(self, visit: int) -> SceneChange:
+        """What changed at a visit, with the masks of its photos.
+
+        Raises:
+            InputError: a file is damaged.
+        """
+        return self.workspace.change(visit, old_masks=False)
+
     def field(self, visit: int) -> Field:
         """The field after a visit.
 

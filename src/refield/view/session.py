@@ -129,7 +129,9 @@ class Session:
         scene, stage = self.client.scene, self.scenery.stage
         scene.remove_by_name(CAMERAS)
         old = self.scenery.capture.frames if self.panel.photos == "all" else ()
-        new = self._change.frames if self._change is not None and self.panel.photos != "none" else ()
+        new = self._change if self.panel.photos != "none" else None
+        if new is not None and self.panel.photos == "marked":
+            new = self.scenery.marked(self._visit)
         shots = shots_of(old, new)
         if not shots:
             return

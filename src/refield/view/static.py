@@ -59,7 +59,7 @@ def _recorded(server: ViserServer, scenery: Scenery, on_stage: OnStage) -> str:
     scene, tape = server.scene, server.get_scene_serializer()
     groups = [scene.add_frame(name, show_axes=False) for name in (CAMERAS, MARKS)]
     before: list[Any] = []
-    old = [s for s in shots_of(scenery.capture.frames, ()) if not s.new][:_OLD_SHOTS]
+    old = [s for s in shots_of(scenery.capture.frames, None) if not s.new][:_OLD_SHOTS]
     size = frustum_size(scenery.stage, scenery.capture.frames)
     for visit in range(scenery.latest + 1):
         on_stage(f"splats of visit {visit}")
@@ -68,7 +68,7 @@ def _recorded(server: ViserServer, scenery: Scenery, on_stage: OnStage) -> str:
             node.visible = False
         change = scenery.changes[visit - 1] if visit else None
         before = [scene.add_frame(f"{name}/{visit}", show_axes=False) for name in (CAMERAS, MARKS)]
-        shots = shots_of((), change.frames) if change is not None else old
+        shots = shots_of((), change) if change is not None else old
         _draw_shots(scene, scenery, shots, size, f"{CAMERAS}/{visit}")
         if change is not None:
             draw_marks(scene, scenery.stage, change, scenery.world, f"{MARKS}/{visit}")
