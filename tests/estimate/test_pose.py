@@ -60,9 +60,8 @@ def stage(tmp_path_factory):
     scene = recipe._detected(capture, BEFORE, frames, config, Models())
     region = recipe.hull.find_region(scene.changed, config.hull)
     carved, free = recipe._carved(scene, region)
-    (old,) = recipe._were_there(
-        scene, carved, changed_parts(scene.changed, carved, free, HullConfig(smallest=40), scene.models.segmenter)[0]
-    )
+    parts = changed_parts(scene.changed, carved, free, HullConfig(smallest=40), scene.models.segmenter)
+    (old,) = recipe._were_there(scene, carved, parts.things, parts.where)
     past = look_past(BEFORE, scene.changed, scene.errors.memory, [old], (config.detect, config.hull))
     return Stage(scene, old, past, capture, frames)
 
@@ -110,6 +109,23 @@ def test_registration_finds_the_turn(stage):
     degrees, distance = error(best[0].new_from_old)
     assert degrees < 1.0 and distance < 0.008
     assert best[0].score < 0.4 and all(a.score <= b.score for a, b in pairwise(best))
+
+
+def test_a_pose_of_which_little_can_be_seen_is_worse_than_one_that_is_seen(stage):
+    """Something stands before most of the crate: what is left of it fits as well as the whole does."""
+    middle = transform(TRUE, CRATE.world_from_box[:3, 3]).numpy().astype(np.float32)
+    anywhere = Target(middle[None], tuple(np.zeros(p.view.shape, np.float32) for p in stage.past))
+    hidden = []
+    for p in stage.past:
+        column = int(p.view.project(middle[None])[0][0, 0])
+        depth = np.zeros_like(p.depth)
+        depth[:, column - 3 : column + 3] = p.depth[:, column - 3 : column + 3]
+        hidden.append(replace(p, depth=depth))
+    up = np.array([0, 0, 1.0])
+    seen, little = (
+        register(stage.old.cloud, past, anywhere, up, extra=[TRUE])[0].score for past in (stage.past, hidden)
+    )
+    assert seen < 0.2 and 0.3 < little < 0.6
 
 
 def test_matched_points_give_the_pose_although_some_are_wrong():

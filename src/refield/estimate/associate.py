@@ -6,7 +6,7 @@ next is looked for. So two newcomers whose hulls run together are told apart by 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 
@@ -201,30 +201,31 @@ def _place_all(
     the newcomer is not looked for.
     """
     sure = [k for k, old in olds.items() if looks_gone(ground, changed, old)]
+    others = [k for k in olds if k not in sure]
     moved: dict[int, PoseChange] = {}
-    for out in [sure, list(olds)] if 0 < len(sure) < len(olds) else [list(olds)]:
+    for out, asked in [(sure, sure), (list(olds), others)] if sure and others else [(list(olds), list(olds))]:
         views = _without(ground, changed, [olds[k] for k in out])
         for k, change in moved.items():
             views = take_off(ground.field, views, olds[k], change)
-        more, views, placed = _place(ground, {k: olds[k] for k in out}, moved, views)
+        more, views, placed = _place(ground, {k: olds[k] for k in out}, asked, views)
         moved, olds = moved | more, olds | placed
     return moved, views, olds
 
 
 def _place(
-    ground: Ground, olds: dict[int, Old], before: Mapping[int, PoseChange], views: list[Past]
+    ground: Ground, olds: dict[int, Old], asked: Sequence[int], views: list[Past]
 ) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:
-    """Place objects that ``views`` are without and that were not placed ``before``, the best first, taking each off."""
+    """Place some of the objects that ``views`` are without, the best first, taking each off."""
     moved: dict[int, PoseChange] = {}
-    tried = [item for item in olds.items() if item[0] not in before][: ground.believe.most]
-    everyone, asked = list(olds.values()), views
-    guess = cache(lambda k: matched_poses(olds[k], asked, ground.survey, ground.matcher))
+    tried = {k: olds[k] for k in asked[: ground.believe.most]}
+    everyone, first = list(olds.values()), views
+    guess = cache(lambda k: matched_poses(olds[k], first, ground.survey, ground.matcher))
     while True:
         parts = newcomers(ground, arrivals(ground, views, everyone), views)[: ground.believe.most]
         fits: dict[int, Fit] = {}
         # what moved before moves again: a piece of something else is tried only on what that leaves unexplained
         for again in (True, False):
-            some = [k for k, old in tried if old.remembered == again and k not in moved and parts]
+            some = [k for k, old in tried.items() if old.remembered == again and k not in moved and parts]
             tries = {k: _best_of(ground, olds[k], everyone, views, parts, guess(k)) for k in some}
             fits |= {k: fit for k, fit in tries.items() if fit is not None}
             if any(fit.change.explained >= ground.believe.shown for fit in fits.values()):
@@ -381,7 +382,10 @@ def _best_of(
     extra: Sequence[Tensor],
 ) -> Fit | None:
     """The better fit of the outlines that an object may have."""
-    fits = [best_fit(ground, o, olds, past, parts, extra) for o in (old, old.instead) if o is not None]
+    fit = best_fit(ground, old, olds, past, parts, extra)
+    if old.instead is None or (fit is not None and fit.change.explained >= ground.believe.shown):
+        return fit
+    fits = [fit, best_fit(ground, old.instead, olds, past, parts, extra)]
     return max((f for f in fits if f is not None), key=lambda f: f.change.explained, default=None)
 
 

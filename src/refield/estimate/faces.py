@@ -8,6 +8,7 @@ left is all inside the changed pixels, while what is behind the newcomer goes on
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -22,16 +23,28 @@ from refield.vision import pixels
 from refield.vision.segmenter import Segmenter, cut_out
 
 _JUMP = 5.0  # pixels' widths; a surface that is fitted well bends by less from one pixel to the next
+_SPEAKS = 0.1  # of the changed pixels that a segmenter must call things; else it found none
 _SHARED = 0.3  # of the smaller of two faces' voxels, for them to be one
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What is solid in the change hull, in parts, the largest first."""
+
+    things: list[Voxels]
+    """those that look like things"""
+    others: list[Voxels]
+    """those that go on outside of the changed pixels"""
+    where: Voxels
+    """voxels at which, or before which, most views show a thing, and none shows anything else"""
 
 
 def changed_parts(
     changed: Sequence[Changed], carved: Hull, free: Voxels, config: HullConfig, segmenter: Segmenter
-) -> tuple[list[Voxels], list[Voxels], Voxels]:
-    """Solid parts of the change hull, the largest first: those that look like things, and the others; and the voxels
-    that most views show a thing at, or behind it.
+) -> Parts:
+    """Solid parts of the change hull.
 
-    Each part has one surface and reaches no deeper behind it than that is wide. ``free``: voxels in front of what holds
+    Each has one surface and reaches no deeper behind it than that is wide. ``free``: voxels in front of what holds
     things up.
     """
     lattice = carved.lattice
@@ -41,7 +54,7 @@ def changed_parts(
     behind = _joined([f for c, t in zip(changed, marked) for f in _faces_in(c.view, c.mask & ~t, lattice, solid)])
     faces = own + behind
     if not faces:
-        return [], [], np.zeros(lattice.shape, bool)
+        return Parts([], [], np.zeros(lattice.shape, bool))
     label = np.zeros(lattice.shape, np.int32)
     for k, face in enumerate(faces, start=1):
         label[face & (label == 0)] = k
@@ -50,16 +63,23 @@ def changed_parts(
     label[box] = label[box][tuple(nearest)]
     things: list[Voxels] = []
     others: list[Voxels] = []
+    where = _where(lattice.centres.reshape(-1, 3), changed, marked, config).reshape(lattice.shape)
     for k, face in enumerate(faces, start=1):
         at = lattice.centres[face]
         width = float((at.max(0) - at.min(0)).max()) + lattice.cell
         mine = solid & (label == k) & (carved.behind < width)
         parts = [p for p in components(mine, config.smallest) if (p & face).any()]
         (things if k <= len(own) else others).extend(parts)
-    shown = [(c.witness(), pixels.dilate(c.mask & t, config.margin)) for c, t in zip(changed, marked)]
-    inside, against = votes(lattice.centres.reshape(-1, 3), shown, config)
-    own_places = ((against == 0) & (2 * inside > len(shown))).reshape(lattice.shape)
-    return sorted(things, key=np.sum, reverse=True), sorted(others, key=np.sum, reverse=True), own_places
+    return Parts(sorted(things, key=np.sum, reverse=True), sorted(others, key=np.sum, reverse=True), where)
+
+
+def _where(points: Array, changed: Sequence[Changed], marked: Sequence[Mask], config: HullConfig) -> Mask:
+    """Points (N, 3) at which, or before which, most views show a thing, and none shows anything else. Views in which the
+    segmenter finds next to nothing say nothing."""
+    shown = [(c, c.mask & mask) for c, mask in zip(changed, marked)]
+    told = [(c.witness(), pixels.dilate(m, config.margin)) for c, m in shown if m.sum() > _SPEAKS * c.mask.sum()]
+    count, against = votes(points, told, config)
+    return (against == 0) & (2 * count > len(told))
 
 
 def _things_in(c: Changed, segmenter: Segmenter) -> Mask:

@@ -62,7 +62,7 @@ class Seeds:
     """in the change hull: it may be part of it"""
     unchanged: Voxels
     """some new view shows it as it was: hardly part of it"""
-    own: Voxels
+    thing: Voxels
     """most new views show it, or what is before it, as a thing: what is changed elsewhere may be its surroundings"""
 
 
@@ -92,7 +92,7 @@ def outline(
     voxels, stands_free = _connected(lattice, solid & free, seeds, config)
     inner = None
     if voxels.any() and not stands_free:
-        core = seeds.changed & seeds.own
+        core = seeds.changed & seeds.thing
         if FEWEST_POINTS <= core.sum() < seeds.changed.sum():
             inner = outline(field, frames, replace(seeds, changed=core), planes, segmenter, config)
         cut = _cut_out(lattice, voxels, patches, segmenter, config)

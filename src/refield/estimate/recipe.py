@@ -13,7 +13,7 @@ from refield.estimate import associate, detect, hull, light, look
 from refield.estimate.associate import AssociateConfig, Ground, Settled, is_crumb, looks_gone, unexplained
 from refield.estimate.conclude import Told, concluded, disagreeing
 from refield.estimate.detect import Changed, DetectConfig, Errors
-from refield.estimate.faces import changed_parts
+from refield.estimate.faces import Parts, changed_parts
 from refield.estimate.hull import Hull, HullConfig
 from refield.estimate.lattice import Lattice, Voxels, grown
 from refield.estimate.look import Array, View
@@ -132,8 +132,8 @@ def estimate_change(
         answer = disagreeing(scene.changed, photos, scene.errors)
         return replace(answer, why=answer.why + beside)
     carved, free = _carved(scene, region)
-    things, others, own = changed_parts(scene.changed, carved, free, config.hull, models.segmenter)
-    olds = _were_there(scene, (carved, own), things or others)
+    parts = changed_parts(scene.changed, carved, free, config.hull, models.segmenter)
+    olds = _were_there(scene, carved, parts.things or parts.others, parts.where)
     say("pose")
     up = scene.planes[0].normal if scene.planes else _up(capture)
     photographed = [f for f in capture.frames if f.made is None]
@@ -142,7 +142,7 @@ def estimate_change(
         config.detect, config.hull, config.objects, config.associate, config.register, config.refine, models.matcher,
     )  # fmt: skip
     settled = associate.settle(ground, olds, scene.changed)
-    more = _overlooked(scene, ground, settled, (things, others, own), olds) if things else []
+    more = _overlooked(scene, ground, settled, parts, olds) if parts.things else []
     if more:
         settled = associate.settle(ground, _whole([*olds, *more]), scene.changed)
     say("segment")
@@ -234,14 +234,14 @@ def _carved(scene: _Scene, region: Lattice) -> tuple[Hull, Voxels]:
 
 
 def _were_there(
-    scene: _Scene, hull: tuple[Hull, Voxels], parts: Sequence[Voxels], known: Sequence[Old] = ()
+    scene: _Scene, carved: Hull, parts: Sequence[Voxels], where: Voxels, known: Sequence[Old] = ()
 ) -> list[Old]:
     """Whole objects of the old field that parts of the change hull belong to, but for those already known.
 
-    ``hull``: with the voxels where most new views show a thing.
+    ``where``: as `Parts` has it.
     """
     found: list[Old] = []
-    (carved, own), config = hull, scene.config
+    config = scene.config
     for part in parts[: config.associate.most]:
         at = carved.lattice.centres[part]
         if any(old.lattice.holds(grown(old.voxels, old.margin), at).mean() > 0.5 for old in (*known, *found)):
@@ -252,7 +252,7 @@ def _were_there(
             if old is not None:
                 found.append(old)
                 continue
-        seeds = Seeds(carved.lattice, part, carved.hull, carved.unchanged, own)
+        seeds = Seeds(carved.lattice, part, carved.hull, carved.unchanged, where)
         old = outline(scene.field, scene.capture.train, seeds, scene.planes, scene.models.segmenter, config.objects)
         if old is not None:
             found.append(old)
@@ -268,25 +268,18 @@ def _whole(olds: list[Old]) -> list[Old]:
     return [o for o in olds if not any(k.volume > o.volume and within(o, k) for k in olds)]
 
 
-def _overlooked(
-    scene: _Scene,
-    ground: Ground,
-    settled: Settled,
-    parts: tuple[list[Voxels], list[Voxels], Voxels],
-    known: list[Old],
-) -> list[Old]:
+def _overlooked(scene: _Scene, ground: Ground, settled: Settled, parts: Parts, known: list[Old]) -> list[Old]:
     """Objects that look like what a newcomer hides, since they go on outside of the changed pixels, and yet left.
 
     What they would explain is explained by nothing else, or the photos show what was behind them. Crumbs are none,
     unless an earlier visit knows them.
     """
-    things, others, _ = parts
-    least = 0.15 * max(float(p.sum()) for p in (*things, *others))
+    least = 0.15 * max(float(p.sum()) for p in (*parts.things, *parts.others))
     more: list[Old] = []
-    for part in others:
+    for part in parts.others:
         needed = unexplained(ground, settled, part)
         if needed or part.sum() >= least:
-            found = _were_there(scene, (ground.hull, part), [part], [*known, *more])
+            found = _were_there(scene, ground.hull, [part], part, [*known, *more])
             found = [o for o in found if o.remembered or not is_crumb(scene.changed, o, ground.believe.crumb)]
             more += [old for old in found if needed or looks_gone(ground, scene.changed, old)]
     return more
