@@ -88,7 +88,7 @@ def _whole(
     field: Field, frames: tuple[Frame, ...], lattice: Lattice, found: Voxels, planes: list[Plane]
 ) -> OccupancyGrid | None:
     """Its shape by all old views, as an update finds it."""
-    seeds = Seeds(lattice, changed=found, hull=grown(found, 2), unchanged=np.zeros_like(found), own=found)
+    seeds = Seeds(lattice, changed=found, hull=grown(found, 2), unchanged=np.zeros_like(found), thing=found)
     old = outline(field, frames, seeds, planes, GrabCutSegmenter(), ObjectConfig())
     return None if old is None else old.grid
 
