@@ -38,6 +38,17 @@ MAY_IMPORT = {
         "history",
     },
     "export": {"scene", "field", "artefacts", "workspace", "history"},
+    "view": {
+        "scene",
+        "field",
+        "estimate",
+        "visits",
+        "report",
+        "export",
+        "artefacts",
+        "workspace",
+        "history",
+    },
     "cli": {"scene", "commands"},
     "commands": None,  # joins everything
     "__init__": None,
@@ -53,6 +64,8 @@ LATE = {  # extras: never when a module is loaded
     "skimage",
     "fast_simplification",
     "yaml",
+    "viser",
+    "websockets",
 }
 
 

@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from refield.report import write_report
-from refield.report.boxes import upright_box
 from refield.report.page import html_page
 from refield.report.plan import Thing, plan
 from refield.report.scene_history import PastVisit, earlier_numbers, history_page
@@ -21,6 +20,7 @@ from refield.report.views import spots_in
 from refield.report.words import headline, length, sentence, stage, sure
 from refield.report.write import PAGE, link_next
 from refield.scene import pose
+from refield.scene.boxes import upright_box
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.world import World
 from tests.visit_pages import CAMERA, WORLD, box, frame, moved, objects, visit_report

@@ -28,6 +28,7 @@ COMMANDS = {
     "report": "the scene's history, all visits on one page",
     "undo": "take the last update back",
     "render": "pictures and films from anywhere, before, after and in between",
+    "view": "the scene in the browser: visits, before and after, what changed; or as one file to send",
     "export": "points, mesh, splats, cameras and changes for other programs",
     "evaluate": "PSNR and SSIM on photos the field has never seen",
     "rehearse": "known changes put into a workspace's own photos: what an update is worth there",

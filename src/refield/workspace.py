@@ -52,6 +52,8 @@ CACHE = ".photos"
 Fitted = HashField | NerfactoField | NerfstudioField
 """the field before any visit, of any architecture"""
 _ARCHITECTURES: dict[str, type[Fitted]] = {c.__name__: c for c in (HashField, NerfactoField, NerfstudioField)}
+VIEWED = ".view"
+"""what the browser is shown of each state, kept for the next time; may be deleted"""
 _OURS = (MARKER, "capture", "field", "visits")
 
 
@@ -308,7 +310,7 @@ class Workspace:
         if not change.objects:
             save_change(folder, replace(change, masks_in=(), masks_out=()))
             return change
-        frames = _copy_photos(folder / "photos", change.frames)
+        frames = _copy_photos(folder / "photos", change.frames) if change.frames else ()
         if frames:
             save_transforms(folder / "photos" / "transforms.json", Capture(frames, held_out_every=0))
         rest = iter(frames)
@@ -353,7 +355,7 @@ def _unmake(made: Sequence[Path]) -> None:
 
 
 def _is_hidden(name: str) -> bool:
-    return name in (LOCK, CACHE) or name.startswith(PART)
+    return name in (LOCK, CACHE, VIEWED) or name.startswith(PART)
 
 
 def _is_kept(name: str) -> bool:

@@ -30,6 +30,7 @@ _EXTRAS = {
     "heic": "HEIC photos, as phones take them",
     "video": "films as MP4: refield render --out film.mp4",
     "export": "meshes and splats: refield export",
+    "view": "the scene in the browser: refield view",
     "nerfstudio": "fields that nerfstudio has trained: refield import",
     "dev": "tests and checks of refield itself",
 }

@@ -48,6 +48,7 @@ def visit_facts(workspace: Workspace, number: int) -> dict[str, Any]:
         "visit": number,
         "made": facts.get("made"),
         "objects": [_told(o) for o in change.objects],
+        "by_hand": change.by_hand,
         "photos_used": len(change.frames),
         "photos_rejected": len(change.photos) - len(change.frames),
         "seconds": round(sum(s for s in facts.get("seconds", {}).values() if s), 1),
@@ -83,9 +84,13 @@ def _table(visits: list[dict[str, Any]]) -> Table:
         out.add_column(name, justify="right" if name in ("visit", "seconds") else "left")
     for v in visits:
         what = "\n".join(_line(o) for o in v["objects"]) or v["why"]
-        rejected = f" ({v['photos_rejected']} rejected)" if v["photos_rejected"] else ""
-        out.add_row(str(v["visit"]), v["made"] or "-", what, f"{v['photos_used']}{rejected}", f"{v['seconds']:.1f}")
+        out.add_row(str(v["visit"]), v["made"] or "-", what, _photos(v), f"{v['seconds']:.1f}")
     return out
+
+
+def _photos(v: dict[str, Any]) -> str:
+    rejected = f" ({v['photos_rejected']} rejected)" if v["photos_rejected"] else ""
+    return "by hand" if v["by_hand"] else f"{v['photos_used']}{rejected}"
 
 
 def _line(o: dict[str, Any]) -> str:

@@ -6,59 +6,25 @@ where it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
 from refield.export.gltf import Glb
+from refield.scene.boxes import UprightBox, upright_box
 from refield.scene.change import ObjectChange, SceneChange
 from refield.scene.files import write_bytes, write_json
-from refield.scene.pose import rigid
 from refield.scene.world import World
 
 _BEFORE, _NOW = (0.9, 0.25, 0.05, 0.35), (0.05, 0.6, 0.2, 0.35)  # linear, with opacity
 
 
-@dataclass(frozen=True)
-class Box:
-    """An oriented box around an object, upright where the object was told of."""
-
-    world_from_box: Tensor
-    """(4, 4) float64: from axes along its sides, z up, with the origin in its middle"""
-    size: tuple[float, float, float]
-    """along its own axes, world units"""
-
-
-def box_of(change: ObjectChange, world: World) -> Box:
-    """The smallest upright box around the occupied part of an object's grid."""
-    points = change.grid.occupied().double()
-    points = points if len(points) else change.grid.aabb.double()
-    level = _level_axes(world)
-    local = points @ level
-    middle, sides, turn = cv2.minAreaRect(np.ascontiguousarray(local[:, :2].numpy(), np.float32))
-    angle = torch.deg2rad(torch.tensor(turn, dtype=torch.float64))
-    cosine, sine = float(angle.cos()), float(angle.sin())
-    spin = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    low, high = float(local[:, 2].min()), float(local[:, 2].max())
-    at = torch.tensor([*middle, (low + high) / 2], dtype=torch.float64)
-    cell = float(change.grid.cell.mean())  # a node stands for half a cell on each side of it
-    size = (sides[0] + cell, sides[1] + cell, high - low + cell)
-    return Box(rigid(level @ spin, level @ at), size)
-
-
-def _level_axes(world: World) -> Tensor:
-    """(3, 3) float64: columns are two level axes and up, right-handed; the world's own x and y where its z is up."""
+def box_of(change: ObjectChange, world: World) -> UprightBox:
+    """The upright box around an object, where it was told of."""
     up = torch.tensor(world.up, dtype=torch.float64)
-    up = up / up.norm()
-    x = torch.eye(3, dtype=torch.float64)[int(up.abs()[:2].argmin())]
-    x = x - (x @ up) * up
-    x = x / x.norm()
-    return torch.stack([x, torch.linalg.cross(up, x), up], -1)
+    return upright_box(change.grid, up / up.norm())
 
 
 def told(change: SceneChange, world: World, visit: int) -> dict[str, Any]:
@@ -103,7 +69,7 @@ def _object(o: ObjectChange, world: World, visit: int, index: int) -> dict[str, 
     }
 
 
-def _places(o: ObjectChange, box: Box) -> tuple[Tensor | None, Tensor | None]:
+def _places(o: ObjectChange, box: UprightBox) -> tuple[Tensor | None, Tensor | None]:
     """Where an object's box was and where it is; None where it was, or is, not there."""
     if o.kind == "moved" and o.new_from_old is not None:
         return box.world_from_box, o.new_from_old.double() @ box.world_from_box

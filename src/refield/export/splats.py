@@ -21,7 +21,8 @@ _WIDE = 0.5  # deviations of a disc, in distances between neighbours: wider is b
 _FLAT = 0.1  # of that is its thickness
 _LARGEST = 3.0  # footprints: a lone point is no large disc
 _OPACITY = 0.99
-_DOME = 40_000  # splats on a whole sphere, 1.0 degree apart
+DOME = 40_000
+"""splats on a whole sphere, 1.0 degree apart"""
 _DOME_FAR = 30.0  # times as far away as the outermost camera is from the middle
 _DOME_WIDE = 0.7
 _DC = 0.28209479177387814  # the harmonic of degree 0
@@ -46,10 +47,14 @@ class Splats:
     def __len__(self) -> int:
         return len(self.means)
 
+    def __getitem__(self, index: Tensor) -> Splats:
+        return Splats(*(getattr(self, f.name)[index] for f in fields(self)))
 
-def splats_of(surface: Surface, views: Sequence[View]) -> Splats:
-    """Discs on the surfaces, and the dome on which lies what the views show beyond them."""
-    discs, dome = discs_of(surface.points), _dome(surface, views)
+
+def splats_of(surface: Surface, views: Sequence[View], around: int = DOME) -> Splats:
+    """Discs on the surfaces, and the dome on which lies what the views show beyond them; ``around``: splats on a whole
+    one."""
+    discs, dome = discs_of(surface.points), _dome(surface, views, around)
     return Splats(*(torch.cat([getattr(discs, f.name), getattr(dome, f.name)]) for f in fields(Splats)))
 
 
@@ -73,15 +78,15 @@ def _turned(normals: Tensor) -> Tensor:
     return functional.normalize(q, dim=-1)
 
 
-def _dome(surface: Surface, views: Sequence[View]) -> Splats:
+def _dome(surface: Surface, views: Sequence[View], around: int) -> Splats:
     """What lies too far away for its distance to be known, around the middle of the cameras.
 
     It is so far out that it shows much the same from wherever photos were taken.
     """
     from scipy.spatial import cKDTree
 
-    step = math.sqrt(4 * math.pi / _DOME)
-    way = _sphere(_DOME)
+    step = math.sqrt(4 * math.pi / around)
+    way = _sphere(around)
     if len(surface.far_directions) == 0:
         way = way[:0]
         rgb = way

@@ -157,7 +157,7 @@ def _view(field: Field, frame: Frame, camera: Camera) -> View:
 
 def surface_of(field: Field, views: Sequence[View], most: int = POINTS) -> Surface:
     """The surfaces that the views show and agree on; ``most``: points, no closer than pixels are."""
-    found = [_ends(view) for view in views]
+    found = [ends_of(view) for view in views]
     xyz, directions, footprint, rgb = (torch.cat(part) for part in zip(*found))
     cells = cells_of(xyz, footprint * _FINE)
     pooled = mean_over(xyz, cells)
@@ -175,7 +175,7 @@ def surface_of(field: Field, views: Sequence[View], most: int = POINTS) -> Surfa
     return Surface(points, directions[far], rgb[far])
 
 
-def _ends(view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def ends_of(view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """World points (P, 3) where a view's rays end, the rays' directions, footprints (P,) and colours (P, 3)."""
     rays, depth = camera_rays(view.camera, view.world_from_cam), view.depth.reshape(-1)
     there = depth.isfinite()
@@ -329,7 +329,7 @@ def _tolerance(views: Sequence[View]) -> float:
     found = []
     for view, other in zip(views, apart.argmin(1).tolist()):
         there = views[other]
-        local = transform(invert(there.world_from_cam), _ends(view)[0][::7])
+        local = transform(invert(there.world_from_cam), ends_of(view)[0][::7])
         pixels, z = there.camera.project(local)
         size = pixels.new_tensor([there.camera.width, there.camera.height])
         inside = (z > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)

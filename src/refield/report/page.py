@@ -28,6 +28,8 @@ _PLAN_NOTE = (
     "The scene from above, seen as the first new photo looks. Dashed: where a thing was. Filled: where it is now. "
     "Wedges: where the new photos were taken."
 )
+_PLAN_ALONE = "The scene from above. Dashed: where a thing was. Filled: where it is now."
+_BY_HAND = "Before and after, from where old photos were taken"
 
 
 def html_page(report: VisitReport) -> str:
@@ -79,12 +81,14 @@ def _parts(report: VisitReport) -> Iterable[str]:
     yield _warnings(report.warnings)
     cameras = [(f"photo {i}", frame) for i, frame in enumerate(report.change.frames, 1)]
     things = [Thing(str(n), o) for n, o in enumerate(objects, 1)]
-    yield _changed(objects, world, plan(things, world, cameras, report.old_frames))
+    note = _PLAN_NOTE if cameras else _PLAN_ALONE
+    yield _changed(objects, world, plan(things, world, cameras, report.old_frames), note)
     rejected = {p.name for p in report.change.photos if p.status == "rejected"}
     photos = [v for v in report.photos if v.name not in rejected]
     views = report.evaluation_views[:MOST_VIEWS]
     most = ALL_PIXELS / max(pictures_in([*photos, *views]), 1)
-    yield _cards("New photos", "Photo", photos, report, most)
+    heads = (_BY_HAND, "View") if report.change.by_hand else ("New photos", "Photo")
+    yield _cards(*heads, photos, report, most)
     yield _rejected(report)
     yield _cards("How true is it? Views that took no part in the update", "View", views, report, most)
     yield _technical(report)
@@ -94,7 +98,7 @@ def _header(report: VisitReport) -> str:
     change = report.change
     made = f'<time datetime="{report.made.isoformat(timespec="seconds")}">{words.date(report.made)}</time>'
     used = len(change.frames)
-    seen = f"{used} new photo{'' if used == 1 else 's'}"
+    seen = "by hand" if change.by_hand else f"{used} new photo{'' if used == 1 else 's'}"
     over = f'<p class="over">{escape(report.title)} · {made} · {seen}</p>'
     lead = "".join(f'<p class="lead">{escape(text)}</p>' for text in _lead(report))
     return f"<header>{over}<h1>{escape(words.headline(change))}</h1>{lead}{_links(report)}</header>"
@@ -130,12 +134,12 @@ def visit_link(number: int, which: str) -> str:
     return f'<a href="../{number:03d}/report.html">{which}: visit {number}</a>'
 
 
-def _changed(objects: Sequence[ObjectChange], world: World | None, drawing: str) -> str:
-    """The objects in words, beside the plan."""
+def _changed(objects: Sequence[ObjectChange], world: World | None, drawing: str, of_plan: str) -> str:
+    """The objects in words, beside the plan and what is said of it."""
     if not objects:
         return ""
     items = "".join(thing(number, o, world) for number, o in enumerate(objects, 1))
-    figure = f'<figure class="map card">{drawing}<figcaption>{_PLAN_NOTE}</figcaption></figure>' if drawing else ""
+    figure = f'<figure class="map card">{drawing}<figcaption>{of_plan}</figcaption></figure>' if drawing else ""
     note = f'<p class="soft">{escape(words.scale_note(world))}</p>'
     return (
         f'<h2>What changed</h2><div class="changed"><div><ol class="things card">{items}</ol>{note}</div>{figure}</div>'

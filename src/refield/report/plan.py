@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from refield.report import words
-from refield.report.boxes import across, upright_box
+from refield.scene.boxes import across, upright_box
 from refield.scene.capture import Frame
 from refield.scene.change import ObjectChange
 from refield.scene.pose import transform

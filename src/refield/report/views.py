@@ -9,10 +9,10 @@ from html import escape
 import torch
 from torch import Tensor
 
-from refield.report.boxes import upright_box
 from refield.report.pictures import data_uri, marks_uri
 from refield.report.visit import Comparison
 from refield.report.words import names, up_of
+from refield.scene.boxes import upright_box
 from refield.scene.capture import Frame
 from refield.scene.change import Kind, ObjectChange
 from refield.scene.pose import invert, transform

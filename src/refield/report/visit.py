@@ -135,7 +135,8 @@ def summary(change: SceneChange) -> str:
     kinds = Counter(o.kind for o in change.objects)
     parts = ", ".join(f"{kinds[k]} {k}" for k in ("moved", "removed", "added") if kinds[k])
     n = len(change.objects)
-    return f"{n} object{'' if n == 1 else 's'} changed: {parts}; seen in {photos}."
+    how = "by hand" if change.by_hand else f"seen in {photos}"
+    return f"{n} object{'' if n == 1 else 's'} changed: {parts}; {how}."
 
 
 def visit_report_dict(report: VisitReport) -> dict[str, Any]:

@@ -11,8 +11,8 @@ from datetime import datetime
 import torch
 from torch import Tensor
 
-from refield.report.boxes import upright_box
 from refield.report.visit import lengths, object_shift, turn, uncertainty
+from refield.scene.boxes import upright_box
 from refield.scene.change import Kind, ObjectChange, SceneChange
 from refield.scene.world import World
 
@@ -50,7 +50,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def headline(change: SceneChange) -> str:
-    """ "Two objects moved, one is gone", without a full stop."""
+    """ "Two objects moved, one is gone", or "One object moved, by hand", without a full stop."""
     if not change.objects:
         return "Something changed that is not understood" if change.unexplained else "Nothing changed"
     kinds = Counter(o.kind for o in change.objects)
@@ -60,7 +60,7 @@ def headline(change: SceneChange) -> str:
             who = _word(kinds[kind]) if parts else counted(kinds[kind], "object")
             be = "" if kind == "moved" else ("is " if kinds[kind] == 1 else "are ")
             parts.append(f"{who} {be}{KINDS[kind]}")
-    text = ", ".join(parts)
+    text = ", ".join([*parts, "by hand"] if change.by_hand else parts)
     return text[0].upper() + text[1:]
 
 

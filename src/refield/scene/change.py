@@ -230,6 +230,8 @@ class SceneChange:
     """Per used photo, (H, W) bool: all changed pixels where something used to be."""
     unexplained: tuple[Tensor, ...] = field(default=())
     """Per used photo, (H, W) bool: changed pixels that nothing of what is said here explains; empty if they are few."""
+    by_hand: bool = False
+    """Whether somebody told it, and no photo was asked."""
 
     @property
     def frames(self) -> tuple[Frame, ...]:
@@ -255,7 +257,7 @@ class SceneChange:
 
     @property
     def _counted(self) -> str:
-        return f"{len(self.frames)} of {len(self.photos)} photos used"
+        return "by hand, no photos" if self.by_hand else f"{len(self.frames)} of {len(self.photos)} photos used"
 
     def _repr_html_(self) -> str:
         from refield.scene import notebook

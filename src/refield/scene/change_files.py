@@ -39,7 +39,7 @@ def save_change(folder: AnyPath, change: SceneChange) -> None:
     folder = as_path(folder, "the change's folder")
     objects = [_object_out(folder, i, o) for i, o in enumerate(change.objects)]
     photos = [_photo_out(folder, p) for p in change.photos]
-    record: dict[str, Any] = {"objects": objects, "photos": photos, "why": change.why}
+    record: dict[str, Any] = {"objects": objects, "photos": photos, "why": change.why, "by_hand": change.by_hand}
     record["masks_in"] = _masks_out(folder, "photos_in", change.masks_in)
     record["masks_out"] = _masks_out(folder, "photos_out", change.masks_out)
     record["unexplained"] = _masks_out(folder, "photos_unexplained", change.unexplained)
@@ -70,6 +70,7 @@ def load_change(
             objects=tuple(_object_in(folder, o, capture, masks and old_masks) for o in record["objects"]),
             photos=tuple(_photo_in(folder, p, {f.name: f for f in photos}) for p in record["photos"]),
             why=str(record.get("why", "")),
+            by_hand=bool(record.get("by_hand", False)),
             **{kind: _photo_masks(folder, record.get(kind, []), masks) for kind in _PHOTO_MASKS},
         )
     except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:

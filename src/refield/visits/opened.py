@@ -12,15 +12,17 @@ from torch import Tensor
 from refield.field.radiance import Field
 from refield.field.render import render_camera
 from refield.field.volrend import Rendering
-from refield.history import changed_visits, state
+from refield.history import changed_visits, known_objects, state
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame
-from refield.scene.change import SceneChange
+from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.errors import InputError, expect, wrong
 from refield.scene.files import AnyPath, as_path, log_warning
 from refield.scene.left_out import Warn
 from refield.scene.world import World
+from refield.visits.by_hand import move_by_hand
 from refield.visits.make import VisitConfig, make_visit, take_back
+from refield.visits.picking import thing_at
 from refield.visits.telling import Hearer, OnProgress, OnStage
 from refield.visits.visit import Visit, kept_visits
 from refield.workspace import Workspace
@@ -120,6 +122,33 @@ class Scene:
         given = _frames(photos)
         by = None if evaluation is None else as_path(evaluation, "the evaluation of an update")
         return make_visit(self._workspace, given, Hearer(on_stage, on_progress, warn), config, evaluation=by)
+
+    def things(self) -> list[OccupancyGrid]:
+        """What visits found out to be things that can move, each where it stands now. See `thing_at` for others."""
+        return [known.grid for known in known_objects(self.field())]
+
+    def thing_at(self, x: Tensor) -> OccupancyGrid | None:
+        """The thing whose surface is at a world point (3,), cut out of the field as it is now, where it stands; None if
+        nothing there stands by itself."""
+        if not isinstance(x, Tensor) or x.shape != (3,):
+            raise wrong("the place of a thing", x, "a world point, a (3,) tensor")
+        return thing_at(self.field(), self.capture(), x)
+
+    def move(self, thing: OccupancyGrid, new_from_old: Tensor) -> Visit:
+        """Say that a thing is elsewhere now, and keep that as a visit without photos; `undo` takes it back.
+
+        Nothing is learnt by it: the place that the thing leaves shows what an earlier visit knows of it, else nothing.
+
+        Args:
+            thing: one of `things`, or from `thing_at`.
+            new_from_old: (4, 4), world: a rotation and a translation, from where it is to where it goes.
+
+        Raises:
+            InputError: the motion is no rigid one, or another process is writing; the workspace is as it was.
+        """
+        expect("the thing to move", thing, OccupancyGrid, "one of scene.things(), or scene.thing_at(a world point)")
+        expect("the thing's motion, new_from_old,", new_from_old, Tensor, "a (4, 4) tensor")
+        return move_by_hand(self._workspace, thing, new_from_old, Hearer())
 
     def render(
         self, view: Frame | Camera, world_from_cam: Tensor | None = None, *, visit: int | None = None

@@ -1,4 +1,4 @@
-"""Upright boxes around what changed: how large a thing is, and the ground that it covers."""
+"""Upright boxes around what changed: how large a thing is, how it is turned, and the ground that it covers."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from refield.scene.change import OccupancyGrid
+from refield.scene.pose import rigid, transform
 
 _MOST_POINTS = 20_000
 
@@ -19,10 +20,23 @@ _MOST_POINTS = 20_000
 class UprightBox:
     """A box with vertical sides, turned about the vertical until its footprint is smallest."""
 
-    corners: Tensor
-    """(8, 3) float64, world: the footprint's four in order, then those above them"""
-    sides: tuple[float, float, float]
-    """longer and shorter side of the footprint, and height; world units"""
+    world_from_box: Tensor
+    """(4, 4) float64: from axes along its sides, z up, with the origin in its middle"""
+    size: tuple[float, float, float]
+    """along its own axes, world units"""
+
+    @property
+    def corners(self) -> Tensor:
+        """(8, 3) float64, world: the footprint's four in order, then those above them."""
+        ring = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+        unit = torch.tensor([(x, y, z) for z in (-1, 1) for x, y in ring], dtype=torch.float64)
+        return transform(self.world_from_box, unit * torch.tensor(self.size, dtype=torch.float64) / 2)
+
+    @property
+    def sides(self) -> tuple[float, float, float]:
+        """Longer and shorter side of the footprint, and height; world units."""
+        x, y, z = self.size
+        return max(x, y), min(x, y), z
 
 
 def across(up: Tensor) -> tuple[Tensor, Tensor]:
@@ -51,7 +65,5 @@ def upright_box(grid: OccupancyGrid, up: Tensor) -> UprightBox:
     rise = float((up.abs() * half_cell).sum())
     heights = points @ up
     low, high = float(heights.min()) - rise, float(heights.max()) + rise
-    foot = x * right + y * ahead
-    ring = [foot + a * width / 2 * along + b * depth / 2 * aside for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    corners = torch.stack([c + h * up for h in (low, high) for c in ring])
-    return UprightBox(corners, (max(width, depth), min(width, depth), high - low))
+    middle = x * right + y * ahead + (low + high) / 2 * up
+    return UprightBox(rigid(torch.stack([along, aside, up], 1), middle), (width, depth, high - low))
