@@ -23,12 +23,15 @@ from tests.export.solid import make_workspace
 sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install 'refield[dev]')")
 pytest.importorskip("viser", reason="needs viser (pip install 'refield[view]')")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)")
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)"),
+    pytest.mark.chain,
+]
 
 AWAY = exp(torch.tensor([0.8, 0.1, 0.0, 0.0, 0.0, 0.3], dtype=torch.float64))
 SIZE = {"width": 900, "height": 420}
 FREE = {"x": 0, "y": 190, "width": 560, "height": 230}  # pixels that no control and no notification covers
-PATIENCE = 60.0  # seconds, on a machine that has other things to do
+PATIENCE = 240.0  # seconds, on a machine that has other things to do
 
 
 @pytest.fixture(scope="module")
