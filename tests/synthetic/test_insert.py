@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from refield.scene.camera import Camera
-from refield.scene.srgb import to_linear
+from refield.scene.srgb import to_linear, to_srgb
 from refield.synthetic.cameras import hemisphere
 from refield.synthetic.insert import Shot, inserted, seen_in
 from refield.synthetic.looks import Look, blur_of, gain_of, noise_of
@@ -121,8 +121,6 @@ def test_noise_and_blur_are_measured():
 
 def test_exposure_is_measured_in_linear_light():
     shown = torch.rand(30, 30, 3, generator=torch.Generator().manual_seed(0)) * 0.5 + 0.2
-    from refield.synthetic.textures import to_srgb
-
     photo = torch.from_numpy(to_srgb(1.3 * to_linear(shown.numpy())))
     known = torch.ones(30, 30, dtype=torch.bool)
     assert gain_of(photo, shown, known) == pytest.approx(torch.full((3,), 1.3), rel=1e-3)
