@@ -67,8 +67,8 @@ class AssociateConfig:
     arrived: float = 0.5
     """part of a newcomer's pixels that nothing else explains"""
     smallest: float = 0.003
-    """part of a photo that something new, or an object which was overlooked at first, must fill in one at least;
-    the paper's contour area is 1 % (§10.2.2)"""
+    """part of a photo that something new, or an object which was overlooked at first, must fill in one at least"""
+    # the paper's contour area is 1 %, §10.2.2
     trim: float = 0.03
     """part of an object's voxels that the new photos or the ground deny, from which on it is trimmed"""
     core: float = 0.25
