@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from refield.cli import main
+from tests.browser import CHROMIUM
 from tests.captures import write_capture
 from tests.photos.reconstructed import reconstructed as reconstructed
 
@@ -29,3 +30,14 @@ def tiny(tmp_path_factory):
     write_capture(folder / "new", 4, turn=0.2)
     assert main(["train", str(folder / "data"), str(folder / "work"), *TINY_FIT]) == 0
     return folder
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Chromium, headless."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM)
+        yield chromium
+        chromium.close()

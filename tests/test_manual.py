@@ -7,7 +7,6 @@ import functools
 import importlib.util
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 import threading
@@ -20,12 +19,12 @@ import pytest
 
 from refield.cli import COMMANDS
 from refield.commands.options import kind_of, parsed
+from tests.browser import CHROMIUM, needs_chromium
 from tests.conftest import HERE
 from tests.test_command_line import OPTION, help_of, options_in
 
 ROOT = Path(__file__).parent.parent
 WORDS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 OURS = [p for p in WORDS if p.name != "results.md"]  # it tells of the benchmarks' options, too
 
 
@@ -120,7 +119,7 @@ class Quiet(SimpleHTTPRequestHandler):
         pass
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)")
+@needs_chromium
 def test_a_browser_finds_an_option_and_asks_nobody_else(served: str) -> None:
     sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install 'refield[dev]')")
     asked: list[str] = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,11 +13,11 @@ import pytest
 from PIL import Image
 
 from refield.report import PastVisit, history_page, write_report
+from tests.browser import needs_chromium
 from tests.visit_pages import WORLD, visit_report
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install 'refield[dev]')")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)")
+pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install 'refield[dev]')")
+pytestmark = needs_chromium
 
 CONTRASTS = """() => {
   const parse = (text) => {
@@ -68,14 +67,6 @@ class Opened:
     page: Any
     said: list[str] = field(default_factory=list)
     asked: list[str] = field(default_factory=list)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM)
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture(scope="module")

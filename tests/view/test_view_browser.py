@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,13 @@ import refield
 from refield.cli import main
 from refield.scene.pose import exp, transform
 from refield.workspace import Workspace
+from tests.browser import needs_chromium
 from tests.export.solid import make_workspace
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install 'refield[dev]')")
+pytest.importorskip("playwright.sync_api", reason="needs playwright (pip install 'refield[dev]')")
 pytest.importorskip("viser", reason="needs viser (pip install 'refield[view]')")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)"),
+    needs_chromium,
     pytest.mark.chain,
 ]
 
@@ -32,14 +32,6 @@ AWAY = exp(torch.tensor([0.8, 0.1, 0.0, 0.0, 0.0, 0.3], dtype=torch.float64))
 SIZE = {"width": 900, "height": 420}
 FREE = {"x": 0, "y": 190, "width": 560, "height": 230}  # pixels that no control and no notification covers
 PATIENCE = 240.0  # seconds, on a machine that has other things to do
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM)
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture(scope="module")

@@ -142,9 +142,7 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
     removed = {k: share for k, share in shares.items() if share is not None}
     kept = [k for k in touched if k in moved or k in removed]
     if len(kept) < len(touched) or trimmed_some:  # what never left hides what is behind it after all
-        views = _without(ground, changed, [olds[k] for k in kept])
-        for k, change in moved.items():
-            views = take_off(ground.field, views, olds[k], change)
+        views = _without(ground, changed, [olds[k] for k in kept], [(olds[k], c) for k, c in moved.items()])
     gone = [olds[k] for k in kept]
     arrived = [p for p in newcomers(ground, arrivals(ground, views, gone), views) if _substantial(ground, p, views)]
     still = torch.eye(4, dtype=torch.float64)
@@ -181,8 +179,14 @@ def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
     return _gone(ground, _without(ground, changed, [old]), old) is not None
 
 
-def _without(ground: Ground, changed: Sequence[Changed], olds: Sequence[Old]) -> list[Past]:
-    return look_past(ground.field, changed, ground.memory, olds, (ground.detect, ground.carving))
+def _without(
+    ground: Ground, changed: Sequence[Changed], olds: Sequence[Old], placed: Sequence[tuple[Old, PoseChange]] = ()
+) -> list[Past]:
+    """The photos past some objects, with those that were placed taken off."""
+    views = look_past(ground.field, changed, ground.memory, olds, (ground.detect, ground.carving))
+    for old, change in placed:
+        views = take_off(ground.field, views, old, change)
+    return views
 
 
 def _gone(ground: Ground, views: Sequence[Past], old: Old) -> float | None:
@@ -194,18 +198,16 @@ def _gone(ground: Ground, views: Sequence[Past], old: Old) -> float | None:
 def _place_all(
     ground: Ground, olds: dict[int, Old], changed: Sequence[Changed]
 ) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:
-    """Place the old objects that fit somewhere, in the photos without those that certainly left, then without all.
+    """Place the changed objects that fit somewhere, in the photos without those that certainly left, then without all.
 
     What a newcomer hides may look like a thing that changed; where that is taken out, nobody knows what is behind, and
     the newcomer is not looked for.
     """
-    sure = [k for k, old in olds.items() if looks_gone(ground, changed, old)]
+    sure = [k for k, old in olds.items() if _gone(ground, _without(ground, changed, [old]), old) is not None]
     others = [k for k in olds if k not in sure]
     moved: dict[int, PoseChange] = {}
     for out, asked in [(sure, sure), (list(olds), others)] if sure and others else [(list(olds), list(olds))]:
-        views = _without(ground, changed, [olds[k] for k in out])
-        for k, change in moved.items():
-            views = take_off(ground.field, views, olds[k], change)
+        views = _without(ground, changed, [olds[k] for k in out], [(olds[k], c) for k, c in moved.items()])
         more, views, placed = _place(ground, {k: olds[k] for k in out}, asked, views)
         moved, olds = moved | more, olds | placed
     return moved, views, olds
