@@ -19,6 +19,7 @@ from refield.artefacts import LOCK, locked
 from refield.cli import main
 from refield.export.gltf import ROOT, quaternion, upright
 from refield.export.recipe import ExportConfig, export
+from refield.export.surface import cells_of
 from refield.field.render import render_camera
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.colmap import load_colmap
@@ -409,3 +410,12 @@ def test_quaternions_are_gltfs():
         turn = exp(torch.tensor([0.0, 0, 0, *vector], dtype=torch.float64))
         x, y, z, w = quaternion(turn[:3, :3])
         assert np.allclose(trimesh.transformations.quaternion_matrix([w, x, y, z]), turn, atol=1e-9)
+
+
+def test_cells_have_numbers_of_their_own():
+    xyz = torch.randn(20_000, 3, generator=torch.Generator().manual_seed(0))
+    places = (xyz / 2**-4 + 0.37).floor()
+    exact = torch.unique(places, dim=0, return_inverse=True)[1]
+    cells = cells_of(xyz, torch.full((len(xyz),), 2**-4))
+    pairs = torch.unique(torch.stack([exact, cells], 1), dim=0)
+    assert len(pairs) == int(exact.max()) + 1 == int(cells.max()) + 1

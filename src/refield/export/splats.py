@@ -17,7 +17,8 @@ from torch.nn import functional
 
 from refield.export.surface import Points, Surface, View, cells_of, mean_over
 
-_WIDE = 0.5  # deviations of a disc, in distances between neighbours: wider is blurred, narrower has holes
+WIDE = 0.5
+"""deviations of a disc, in distances between neighbours: wider is blurred, narrower has holes"""
 _FLAT = 0.1  # of that is its thickness
 _LARGEST = 3.0  # footprints: a lone point is no large disc
 _OPACITY = 0.99
@@ -60,7 +61,7 @@ def splats_of(surface: Surface, views: Sequence[View], around: int = DOME) -> Sp
 
 def discs_of(points: Points) -> Splats:
     """One for each point."""
-    wide = _WIDE * torch.minimum(points.spacing, _LARGEST * points.footprint)
+    wide = WIDE * torch.minimum(points.spacing, _LARGEST * points.footprint)
     return _discs(points.xyz, points.normal, wide, points.rgb)
 
 

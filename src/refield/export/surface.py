@@ -312,6 +312,7 @@ def cells_of(xyz: Tensor, size: Tensor) -> Tensor:
     key = level.long() * 0x1D8E4E27C47D124F
     for axis, factor in enumerate((0x9E3779B97F4A7C1, 0x2545F4914F6CDD1D, 0x27220A95FE8D3A59)):
         key = (key ^ place[:, axis]) * factor
+        key = key ^ ((key >> 32) & 0xFFFFFFFF)  # else cells on opposite sides of the origin share a number
     return torch.unique(key, return_inverse=True)[1]
 
 

@@ -10,27 +10,36 @@ from torch import Tensor
 
 from refield.export.splats import Splats
 from refield.scene.world import World
-from refield.view.cast import Glimpse
+from refield.view.cast import Cloud
 from refield.view.stage import Stage
 
 if TYPE_CHECKING:
     from viser import SceneApi
 
 STATE, POINTS = "/state/splats", "/state/points"
-_POINT = 0.012  # units of the stage
+_COVERS = 0.7  # a point's size in viser, in distances between neighbours: twice as wide it is drawn
+_SIZES = 2  # of points, for each doubling
 _THINNEST = 1e-3  # units of the stage: half floats hold no thinner disc
 
 
-def draw_glimpse(scene: SceneApi, stage: Stage, glimpse: Glimpse) -> None:
-    """Points in place of what was drawn of another state."""
-    scene.add_point_cloud(
-        POINTS,
-        stage.points(glimpse.xyz),
-        _bytes(glimpse.rgb),
-        point_size=_POINT,
-        point_shape="circle",
-        point_shading="flat",
-    )
+def draw_points(scene: SceneApi, stage: Stage, cloud: Cloud) -> None:
+    """Points in place of what was drawn of another state, each so large that they leave no gaps."""
+    scene.remove_by_name(POINTS)
+    scene.add_frame(POINTS, show_axes=False)
+    wide = (cloud.apart * stage.scale * _COVERS).clamp_min(_THINNEST)
+    # a cloud of viser's has points of one size
+    sizes = (_SIZES * wide.log2()).round()
+    for size in sizes.unique().tolist():
+        own = sizes == size
+        scene.add_point_cloud(
+            f"{POINTS}/{size:.0f}",
+            stage.points(cloud.xyz[own]),
+            _bytes(cloud.rgb[own]),
+            point_size=2 ** (size / _SIZES),
+            point_shape="square",
+            point_shading="flat",
+            precision="float32",
+        )
     scene.remove_by_name(STATE)
 
 
@@ -62,9 +71,12 @@ def covariances(splats: Splats, scale: float) -> np.ndarray:
     return (axes @ axes.transpose(-1, -2)).numpy()
 
 
-def look_from_afar(scene: SceneApi, world: World) -> None:
-    """What is the same for every state: which way is up."""
+def set_stage(scene: SceneApi, world: World) -> None:
+    """What is the same for every state: which way is up, and that nothing which is drawn casts shadows or mirrors
+    anything. Where a processor draws, both would take longer than all else."""
     scene.set_up_direction(world.up)
+    scene.configure_default_lights(cast_shadow=False)
+    scene.configure_environment_map(None)
 
 
 def _bytes(rgb: Tensor) -> np.ndarray:

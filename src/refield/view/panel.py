@@ -26,8 +26,8 @@ OnChange = Callable[[str], None]
 
 
 class Panel:
-    """Sliders, switches and words of one browser. ``on_change`` hears what was changed: "visit", "look", "marks" or
-    "photos"."""
+    """Sliders, switches and words of one browser. ``on_change`` hears what was changed: "visit", "look", "layer",
+    "marks" or "photos"."""
 
     def __init__(self, gui: GuiApi, scenery: Scenery, on_change: OnChange) -> None:
         self.gui, self._scenery = gui, scenery
@@ -45,7 +45,7 @@ class Panel:
         for handle, what in (
             (self._visit, "visit"),
             (self._wipe, "look"),
-            (self._layer, "look"),
+            (self._layer, "layer"),
             (self._photos, "photos"),
             (self._marks, "marks"),
         ):

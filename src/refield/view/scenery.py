@@ -15,7 +15,7 @@ from refield.scene.change import SceneChange
 from refield.scene.errors import InputError
 from refield.scene.left_out import Warn
 from refield.scene.world import World
-from refield.view.cast import Glimpse, glimpse_of, keep_splats, kept_splats, name_of_state, splats_for
+from refield.view.cast import Cloud, cloud_of, glimpse_of, keep_splats, kept_splats, name_of_state, splats_for
 from refield.view.stage import Stage
 from refield.view.turns import Turns
 from refield.workspace import Workspace
@@ -45,8 +45,9 @@ class Scenery:
     changes: list[SceneChange] = field(init=False)
     """of each visit, without masks"""
     _fields: dict[str, Field] = field(default_factory=dict)
-    _glimpses: dict[str, Glimpse] = field(default_factory=dict)
+    _glimpses: dict[str, Cloud] = field(default_factory=dict)
     _splats: dict[str, Splats] = field(default_factory=dict)
+    _clouds: dict[str, Cloud] = field(default_factory=dict)
     _wanted: list[int] = field(default_factory=list)
     _stir: threading.Condition = field(default_factory=threading.Condition)
     _thread: threading.Thread | None = None
@@ -94,10 +95,17 @@ class Scenery:
             raise InputError(self.workspace.path, f"there is no visit {visit} any longer", "choose another")
         return _kept(self._fields, names[visit], _FIELDS, lambda: state(self.workspace, visit))
 
-    def glimpse(self, visit: int) -> Glimpse:
-        """Points of a state."""
+    def glimpse(self, visit: int) -> Cloud:
+        """Points of a state, for as long as it has no splats."""
         make = lambda: glimpse_of(self.field(visit), self.frames(visit))  # noqa: E731
         return _kept(self._glimpses, self._names[visit], _CLOUDS, make)
+
+    def cloud(self, visit: int) -> Cloud | None:
+        """The points of a state's splats, if these are ready; else as `splats`."""
+        splats = self.splats(visit)
+        if splats is None:
+            return None
+        return _kept(self._clouds, self._names[visit], _CLOUDS, lambda: cloud_of(splats))
 
     def splats(self, visit: int) -> Splats | None:
         """A state's splats, if they are ready; else they are made, and `on_splats` hears of it."""

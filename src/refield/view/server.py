@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from refield.scene.errors import InputError
 from refield.scene.left_out import Warn
 from refield.view.cast import SPLATS
-from refield.view.draw import look_from_afar
+from refield.view.draw import set_stage
 from refield.view.scenery import Scenery
 from refield.view.session import Session
 from refield.workspace import Workspace
@@ -36,7 +36,7 @@ class Viewer:
         self.scenery = Scenery(workspace, splats, warn)
         self._sessions: dict[int, Session] = {}
         self._server = opened_server(port)
-        look_from_afar(self._server.scene, self.scenery.world)
+        set_stage(self._server.scene, self.scenery.world)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._left)
         self.scenery.on_splats.append(self._splats_ready)

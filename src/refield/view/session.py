@@ -13,9 +13,11 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Frame
 from refield.scene.change import SceneChange
 from refield.scene.errors import InputError
-from refield.view.draw import draw_glimpse, draw_splats
+from refield.view.cast import Cloud
+from refield.view.draw import POINTS, STATE, draw_points, draw_splats
 from refield.view.marks import CAMERAS, MARKS, draw_marks, draw_shot, frustum_size, pictured, shots_of
 from refield.view.mover import Mover
+from refield.view.pace import DETAILS, Detail, Pace
 from refield.view.panel import Panel
 from refield.view.scenery import Scenery
 from refield.view.stage import first_look
@@ -36,7 +38,9 @@ class Session:
         self.client, self.scenery = client, scenery
         self._lock = threading.RLock()
         self._visit = scenery.latest
-        self._standing = StandingView(self._state, self._show_picture, scenery.turns, self._rested)
+        self._pace = Pace()
+        rest = lambda: self._pace.rest  # noqa: E731
+        self._standing = StandingView(self._state, self._show_picture, scenery.turns, self._rested, rest)
         self._due = True  # the state that is shown has yet to be drawn
         self._sharp, self._closed = True, False  # until the first picture is there nothing else need be drawn
         self._waits_until = time.monotonic() + _FIRST
@@ -100,18 +104,26 @@ class Session:
     def _state(self, visit: int) -> Any:
         return self.scenery.field(visit)
 
+    @property
+    def _detail(self) -> Detail:
+        """What is drawn of the state while the view moves; who asks for splats gets them, however long they take."""
+        return DETAILS[-1] if self.panel.layer == "splats" else self._pace.detail
+
     def _draw_state(self) -> None:
         self._due = False
-        splats = self.scenery.splats(self._visit)
+        detail, stage = self._detail, self.scenery.stage
+        splats, cloud = self.scenery.splats(self._visit), self.scenery.cloud(self._visit)
         with self.client.atomic():
-            if splats is not None:
-                draw_splats(self.client.scene, self.scenery.stage, splats)
+            if splats is not None and detail.kind == "splats":
+                draw_splats(self.client.scene, stage, splats)
             else:
-                with self.scenery.turns.first():
-                    glimpse = self.scenery.glimpse(self._visit)
-                draw_glimpse(self.client.scene, self.scenery.stage, glimpse)
+                draw_points(self.client.scene, stage, (cloud or self._glimpse()).thinned(detail.part))
             self._hide_state(self._sharp)
         self.panel.preparing(splats is None)
+
+    def _glimpse(self) -> Cloud:
+        with self.scenery.turns.first():
+            return self.scenery.glimpse(self._visit)
 
     def _draw_marks(self) -> None:
         scene = self.client.scene
@@ -175,6 +187,8 @@ class Session:
                 self._draw_marks()
             elif what == "photos":
                 self._draw_photos()
+            elif what == "layer":
+                self._draw_state()
         self._look()
 
     def _saved(self, visit: int) -> None:
@@ -186,6 +200,9 @@ class Session:
 
     def _moved(self, camera: CameraHandle) -> None:
         self._unsharpen()
+        with self._lock:
+            if self._pace.picture(camera.update_timestamp) and not self._closed:
+                self._draw_state()
         self._look()
 
     def _look(self) -> None:
@@ -216,6 +233,7 @@ class Session:
     def _rested(self) -> None:
         """Our own picture is there: time to draw the state behind it, for when the camera moves."""
         with self._lock:
+            self._due |= self._pace.rests(time.time())
             if self._due and not self._closed:
                 self._draw_state()
 
@@ -223,6 +241,7 @@ class Session:
         with self._lock:
             if self._sharp and time.monotonic() > self._waits_until:
                 self._sharp = False
+                self._pace.set_out()
                 if self._due:
                     self._draw_state()
                 with self.client.atomic():
@@ -230,7 +249,7 @@ class Session:
                     self.client.scene.set_background_image(None)
 
     def _hide_state(self, hidden: bool) -> None:
-        for name in ("/state/splats", "/state/points"):
+        for name in (STATE, POINTS):
             node = self.client.scene.get_handle_by_name(name)
             if node is not None:
                 node.visible = not hidden

@@ -26,7 +26,6 @@ from refield.view.marks import IS, WAS
 from refield.view.turns import Turns
 
 Layer = Literal["sharp", "depth", "changed"]
-REST = 0.25  # seconds without a move, after which a view stands
 PARTS = (0.15, 0.4, 1.0)  # of the screen's pixels a side, one after the other
 _BAND = 24_576  # rays rendered between two looks at whether the camera moved
 _MOST = 1_100_000  # pixels
@@ -80,6 +79,8 @@ class StandingView:
     turns: Turns
     rested: Callable[[], None] = lambda: None
     """hears that a picture is as fine as it gets"""
+    rest: Callable[[], float] = lambda: 0.25
+    """seconds without a move, after which a view stands"""
     _wanted: Looking | None = None
     _count: int = 0
     """of requests; whoever works for an earlier one stops"""
@@ -122,7 +123,7 @@ class StandingView:
                 self._await_other(done, None)
                 wanted, done = self._wanted, self._count
                 again = wanted is not None and self._place is not None and wanted.same_place(self._place)
-                moved = not again and self._await_other(done, REST)
+                moved = not again and self._await_other(done, self.rest())
             if wanted is not None and not moved:
                 with contextlib.suppress(InputError):  # of a visit that was taken back meanwhile
                     self._render(wanted, done)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from refield.report.page import GENERATOR
 from refield.scene.errors import InputError
-from refield.view.draw import draw_splats, look_from_afar
+from refield.view.draw import draw_splats, set_stage
 from refield.view.marks import CAMERAS, MARKS, Shot, draw_marks, draw_shot, frustum_size, pictured, shots_of
 from refield.view.scenery import Scenery
 from refield.view.server import opened_server, stop
@@ -40,7 +40,7 @@ def static_page(scenery: Scenery, on_stage: OnStage = lambda name: None) -> str:
     look = first_look(scenery.stage, scenery.capture.frames, scenery.world)
     server = opened_server(0)
     try:
-        look_from_afar(server.scene, scenery.world)
+        set_stage(server.scene, scenery.world)
         camera = server.initial_camera
         camera.position, camera.look_at, camera.up, camera.fov = look.position, look.look_at, look.up, look.fov
         html = _recorded(server, scenery, on_stage)
