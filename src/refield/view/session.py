@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle
 
 _QUALITY = 92  # of our own pictures, as JPEG
-_FIRST = 3.0  # seconds after which states are drawn even if no picture of ours is there yet
 _EMPTY = 160.0  # units of the stage, about as far as viser's depths reach: where nothing is
 
 
@@ -42,8 +41,7 @@ class Session:
         rest = lambda: self._pace.rest  # noqa: E731
         self._standing = StandingView(self._state, self._show_picture, scenery.turns, self._rested, rest)
         self._due = True  # the state that is shown has yet to be drawn
-        self._sharp, self._closed = True, False  # until the first picture is there nothing else need be drawn
-        self._waits_until = time.monotonic() + _FIRST
+        self._sharp, self._closed = False, False
         self._photos: str | None = None
         self.panel = Panel(client.gui, scenery, self._changed)
         self.mover = Mover(client, scenery, self.panel, self._saved)
@@ -227,7 +225,7 @@ class Session:
         depth = np.nan_to_num(picture.depth * self.scenery.stage.scale, posinf=_EMPTY).clip(0, _EMPTY)
         with self._lock, self.client.atomic():
             self.client.scene.set_background_image(picture.rgb, format="jpeg", jpeg_quality=_QUALITY, depth=depth)
-            self._sharp, self._waits_until = True, 0.0
+            self._sharp = True
             self._hide_state(True)
 
     def _rested(self) -> None:
@@ -239,7 +237,7 @@ class Session:
 
     def _unsharpen(self) -> None:
         with self._lock:
-            if self._sharp and time.monotonic() > self._waits_until:
+            if self._sharp:
                 self._sharp = False
                 self._pace.set_out()
                 if self._due:
