@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -51,8 +52,10 @@ def told(run: Callable[[], Answer | None], *, as_json: bool) -> int:
     """Run a command, tell its answer on stdout, and return its exit code.
 
     As JSON stdout gets one document whatever happens; of a command that fails it is ``{"error": …}``. What else is
-    printed meanwhile goes to stderr then.
+    printed meanwhile goes to stderr then. Each document tells in ``seconds`` how long the command took, where the
+    command itself tells nothing else by that name.
     """
+    began = time.perf_counter()
     try:
         with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
             answer = run() or Answer({})
@@ -62,7 +65,7 @@ def told(run: Callable[[], Answer | None], *, as_json: bool) -> int:
         raise
     if as_json:
         more = {} if answer.stop is None else error_document(answer.stop)
-        print_json({**answer.document, **more})
+        print_json({"seconds": round(time.perf_counter() - began, 3), **answer.document, **more})
     else:
         for words in answer.words:
             _say(words)
