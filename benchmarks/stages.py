@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -22,6 +21,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from chromium import CHROMIUM
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter, ImageFont
 from torch import Tensor
@@ -230,15 +230,14 @@ def updated(s: Stages) -> list[Tile]:
 
 def report(page: Path) -> Image.Image | None:
     """The upper part of a report's page; None where there is no browser."""
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     try:
         from playwright.sync_api import sync_playwright
     except ImportError:
         return None
-    if chromium is None:
+    if CHROMIUM is None:
         return None
     with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        browser = play.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         view = browser.new_page(viewport={"width": 900, "height": 1150})
         view.goto(page.resolve().as_uri())
         shot = view.screenshot()
