@@ -178,16 +178,16 @@ def test_the_page_that_is_sent_needs_nothing(browser: Any, work: Path, tmp_path:
     page.on("request", lambda request: asked.append(request.url))
     clock = page.locator(".mantine-NumberInput-input")
     clock.wait_for(state="attached")
-    eventually(lambda: clock.input_value() == "10.5")
+    eventually(lambda: clock.input_value() == "18.5")
     page.get_by_text("One object moved, by hand").wait_for()
     now = settled(page)
     assert len(np.unique(now.reshape(-1, 3), axis=0)) > 500
     page.locator("#visit").press("ArrowLeft")
-    eventually(lambda: clock.input_value() == "6.5")
+    eventually(lambda: clock.input_value() == "10.5")
     page.get_by_text("One object moved, one is gone, one is new").wait_for()
     eventually(lambda: differ(picture(page), now) > 0.02)
     page.locator("#marks").uncheck()
-    eventually(lambda: clock.input_value() == "4.5")
+    eventually(lambda: clock.input_value() == "8.5")
     for width in (1280, 400):
         page.set_viewport_size({"width": width, "height": 500})
         assert page.evaluate("document.documentElement.scrollWidth") == width

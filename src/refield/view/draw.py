@@ -1,4 +1,4 @@
-"""States in the browser: points or splats under one name, so that a later one takes the place of an earlier one."""
+"""States in the browser: points and splats each under one name, so that later ones take the place of earlier ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from refield.view.cast import Cloud
 from refield.view.stage import Stage
 
 if TYPE_CHECKING:
-    from viser import SceneApi
+    from viser import SceneApi, SceneNodeHandle
 
 STATE, POINTS = "/state/splats", "/state/points"
 _COVERS = 0.7  # a point's size in viser, in distances between neighbours: twice as wide it is drawn
@@ -22,10 +22,10 @@ _SIZES = 2  # of points, for each doubling
 _THINNEST = 1e-3  # units of the stage: half floats hold no thinner disc
 
 
-def draw_points(scene: SceneApi, stage: Stage, cloud: Cloud) -> None:
-    """Points in place of what was drawn of another state, each so large that they leave no gaps."""
+def draw_points(scene: SceneApi, stage: Stage, cloud: Cloud) -> SceneNodeHandle:
+    """Points in place of those of another state, each so large that they leave no gaps."""
     scene.remove_by_name(POINTS)
-    scene.add_frame(POINTS, show_axes=False)
+    node = scene.add_frame(POINTS, show_axes=False)
     wide = (cloud.apart * stage.scale * _COVERS).clamp_min(_THINNEST)
     # a cloud of viser's has points of one size
     sizes = (_SIZES * wide.log2()).round()
@@ -40,14 +40,14 @@ def draw_points(scene: SceneApi, stage: Stage, cloud: Cloud) -> None:
             point_shading="flat",
             precision="float32",
         )
-    scene.remove_by_name(STATE)
+    return node
 
 
-def draw_splats(scene: SceneApi, stage: Stage, splats: Splats, name: str = STATE, **pose: Any) -> None:
-    """Splats, by default in place of what was drawn of another state; ``pose``: of the node, viser's words."""
+def draw_splats(scene: SceneApi, stage: Stage, splats: Splats, name: str = STATE, **pose: Any) -> SceneNodeHandle:
+    """Splats, by default in place of those of another state; ``pose``: of the node, viser's words."""
     # from afar first: a browser that has not sorted them yet draws them in this order
     splats = splats[(splats.means.double() - stage.middle).norm(dim=1).argsort(descending=True)]
-    scene.add_gaussian_splats(
+    return scene.add_gaussian_splats(
         name,
         stage.points(splats.means),
         covariances(splats, stage.scale),
@@ -55,8 +55,6 @@ def draw_splats(scene: SceneApi, stage: Stage, splats: Splats, name: str = STATE
         splats.opacities[:, None].numpy(),
         **pose,
     )
-    if name == STATE:
-        scene.remove_by_name(POINTS)
 
 
 def covariances(splats: Splats, scale: float) -> np.ndarray:

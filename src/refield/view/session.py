@@ -114,8 +114,10 @@ class Session:
         with self.client.atomic():
             if splats is not None and detail.kind == "splats":
                 draw_splats(self.client.scene, stage, splats)
+                self.client.scene.remove_by_name(POINTS)
             else:
                 draw_points(self.client.scene, stage, (cloud or self._glimpse()).thinned(detail.part))
+                self.client.scene.remove_by_name(STATE)
             self._hide_state(self._sharp)
         self.panel.preparing(splats is None)
 

@@ -13,17 +13,18 @@
     };
   }
 
-  const STEPS = 4; // of a state: without and with photos, without and with boxes
+  const STEPS = 8; // of a state: without and with photos, without and with boxes, as splats and as points
   const at = (id) => document.getElementById(id);
   const visit = at("visit");
   const marks = at("marks");
   const photos = at("photos");
+  const points = at("points");
   const words = document.querySelectorAll("aside .visit");
 
   // the scene is a recording, a second for each way to show a state; the box with the time goes anywhere in it
   const clock = () => document.querySelector("#root .mantine-NumberInput-input");
   const setValue = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set;
-  const wanted = () => STEPS * Number(visit.value) + 2 * marks.checked + 1 * photos.checked + 0.5;
+  const wanted = () => STEPS * Number(visit.value) + 4 * points.checked + 2 * marks.checked + 1 * photos.checked + 0.5;
 
   const show = () => {
     at("number").textContent = visit.value;
@@ -35,7 +36,25 @@
     return true;
   };
 
-  for (const control of [visit, marks, photos]) control.addEventListener("input", show);
+  for (const control of [visit, marks, photos, points]) control.addEventListener("input", show);
+  // a browser that needs longer than this for a picture while somebody drags is given points; who wants splats yet may
+  // ask for them, and keeps them
+  const SLOW = 100; // milliseconds
+  const LOOK = 1000; // milliseconds, and one picture at least after the first two
+  let asked = false;
+  points.addEventListener("input", () => (asked = true));
+  at("root").addEventListener("pointerdown", () => {
+    const times = [];
+    const tick = (now) => {
+      times.push(now);
+      if (times.length < 3 || now - times[1] < LOOK) return requestAnimationFrame(tick);
+      if (asked || points.checked || (now - times[1]) / (times.length - 2) <= SLOW) return;
+      points.checked = true;
+      show();
+    };
+    requestAnimationFrame(tick);
+  });
+
   const begun = new MutationObserver(() => {
     const box = clock();
     if (!box) return;

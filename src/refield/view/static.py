@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from refield.report.page import GENERATOR
 from refield.scene.errors import InputError
-from refield.view.draw import draw_splats, set_stage
+from refield.view.cast import cloud_of
+from refield.view.draw import POINTS, STATE, draw_points, draw_splats, set_stage
 from refield.view.marks import CAMERAS, MARKS, Shot, draw_marks, draw_shot, frustum_size, pictured, shots_of
 from refield.view.scenery import Scenery
 from refield.view.server import opened_server, stop
@@ -22,12 +23,13 @@ from refield.view.told import told
 
 if TYPE_CHECKING:
     from viser import SceneApi, ViserServer
+    from viser.infra import StateSerializer
 
 ALL_SPLATS = 400_000
 """of all states of a page together, about and at most"""
 _FEWEST = 20_000  # of a state
 _OLD_SHOTS = 24
-_STEPS = 4  # of a state: without and with photos, without and with boxes
+_POINTS = 1 / 4  # of the splats
 OnStage = Callable[[str], None]
 
 
@@ -63,7 +65,9 @@ def _recorded(server: ViserServer, scenery: Scenery, on_stage: OnStage) -> str:
     size = frustum_size(scenery.stage, scenery.capture.frames)
     for visit in range(scenery.latest + 1):
         on_stage(f"splats of visit {visit}")
-        draw_splats(scene, scenery.stage, scenery.make_splats(visit))
+        splats = scenery.make_splats(visit)
+        scene.remove_by_name(POINTS)
+        draw_splats(scene, scenery.stage, splats)
         for node in before:
             node.visible = False
         change = scenery.changes[visit - 1] if visit else None
@@ -72,12 +76,20 @@ def _recorded(server: ViserServer, scenery: Scenery, on_stage: OnStage) -> str:
         _draw_shots(scene, scenery, shots, size, f"{CAMERAS}/{visit}")
         if change is not None:
             draw_marks(scene, scenery.stage, change, scenery.world, f"{MARKS}/{visit}")
-        for step in range(_STEPS):
-            for bit, group in enumerate(groups):
-                group.visible = bool(step >> bit & 1)
-            tape.insert_sleep(1.0)
+        _play_switches(tape, groups)
+        scene.remove_by_name(STATE)  # a splat that is hidden takes a browser some time, too
+        draw_points(scene, scenery.stage, cloud_of(splats).thinned(_POINTS))
+        _play_switches(tape, groups)
     on_stage("page")
     return tape.as_html()
+
+
+def _play_switches(tape: StateSerializer, groups: Sequence[Any]) -> None:
+    """A second for each way to show some of the groups: the first is the lowest bit."""
+    for step in range(1 << len(groups)):
+        for bit, group in enumerate(groups):
+            group.visible = bool(step >> bit & 1)
+        tape.insert_sleep(1.0)
 
 
 def _draw_shots(scene: SceneApi, scenery: Scenery, shots: Sequence[Shot], size: float, under: str) -> None:
@@ -111,7 +123,8 @@ def _page(html: str, scenery: Scenery) -> str:
         f'<aside><h1>{name}</h1><label for="visit">Visit <output id="number">{latest}</output></label>'
         f'<input type="range" id="visit" max="{max(latest, 1)}" value="{latest}"{"" if latest else " disabled"}>'
         '<p class="switches"><label><input type="checkbox" id="marks" checked> boxes and numbers</label>'
-        f'<label><input type="checkbox" id="photos"> photos</label></p>{words}'
+        f'<label><input type="checkbox" id="photos"> photos</label>'
+        f'<label><input type="checkbox" id="points"> points, which are drawn quicker</label></p>{words}'
         '<p class="soft">Drag to turn, scroll to come nearer, drag with the right button to go aside.</p></aside>'
     )
     script = f"<script>{_resource('static.js')}</script>"
