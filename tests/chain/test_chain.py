@@ -10,6 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
+import torch
+
+import refield
+from refield.cli import main
+from refield.synthetic import sample_folder
 
 pytestmark = pytest.mark.chain
 
@@ -92,3 +97,20 @@ def test_random_world(world) -> None:
 
 def test_photographs(photographs) -> None:
     check(photographs("fox_moved"), FOX)
+
+
+def test_photos_tell_what_was_moved_by_hand(tmp_path) -> None:
+    """The demo's cube is moved on by hand, and then looked at where it really is."""
+    assert main(["demo", str(tmp_path / "work"), "--fit.steps", "500", "--quiet"]) == 0
+    scene = refield.open(tmp_path / "work")
+    (thing,) = scene.things()
+    away = torch.eye(4, dtype=torch.float64)
+    away[:2, 3] = torch.tensor([-0.25, 0.35])
+    scene.move(thing, away)
+    visit = scene.update(sample_folder() / "after")
+    (o,) = visit.change.objects
+    assert o.kind == "moved" and not visit.change.by_hand
+    assert o.shift is not None and float((o.shift + away[:3, 3]).norm()) < 0.02 and abs(o.turn_deg or 0.0) < 2
+    (there,) = scene.things()
+    assert float((there.centre - thing.centre).norm()) < 0.03
+    assert len(scene.visits) == 3

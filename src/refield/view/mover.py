@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 GIZMO = "/moved"
 _NONE = "choose one"
+_AS_BEFORE = "Where it stood is shown what was there before it came."
+_EMPTY = "Where it stood is an empty place now: what was under it or behind it no photo has shown."
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Mover:
         self._gizmo: Any = None
         self._busy = threading.Lock()
         gui = client.gui
-        with gui.add_folder("Move a thing by hand", expand_by_default=False):
+        with panel.home, gui.add_folder("Move a thing by hand", expand_by_default=False):
             self._things: Any = gui.add_dropdown("Thing", (_NONE,), hint="things that visits found out")
             self._pick = gui.add_button("Pick one in the scene", hint="then click on it")
             self._save = gui.add_button("Save as a visit", disabled=True)
@@ -190,8 +192,11 @@ class Mover:
             visit = move_by_hand(
                 self._scenery.workspace, held.grid, there @ invert(held.world_from_box), Hearer(warn=self._scenery.warn)
             )
+        # of a thing that a visit brought there it is known what was there before it
+        known = any(held.grid is grid for grid in self._known.values())
         self._on_saved(visit.number)
-        self._say(f"Kept as visit {visit.number}. What it stood on, no photo has shown: it stays open.")
+        left = _AS_BEFORE if known else _EMPTY
+        self._say(f"Kept as visit {visit.number}. {left}")
 
     def _take_back(self) -> None:
         with self._scenery.turns.first():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -27,21 +28,18 @@ OnChange = Callable[[str], None]
 
 class Panel:
     """Sliders, switches and words of one browser. ``on_change`` hears what was changed: "visit", "look", "layer",
-    "marks" or "photos"."""
+    "marks" or "photos". ``folded``: they are all in a folder that is closed at first."""
 
-    def __init__(self, gui: GuiApi, scenery: Scenery, on_change: OnChange) -> None:
+    def __init__(self, gui: GuiApi, scenery: Scenery, on_change: OnChange, folded: bool = False) -> None:
         self.gui, self._scenery = gui, scenery
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         gui.set_panel_label(scenery.workspace.path.resolve().name)
-        self._told = gui.add_html("")
-        self._visit: Any = gui.add_slider("Visit", 0, max(scenery.latest, 1), 1, scenery.latest, hint="0 is before any")
-        self._visit.disabled = scenery.latest == 0
-        self._wipe = gui.add_slider("Before", 0, 100, 1, 0, hint="how much of the picture shows the visit before, in %")
-        self._layer = gui.add_dropdown("Picture", tuple(_LAYERS), hint="what is shown when the camera stands still")
-        self._photos = gui.add_dropdown("Photos", tuple(_PHOTOS), hint="click on one to stand where it was taken")
-        self._marks = gui.add_checkbox("Boxes and numbers", True)
-        self._note = gui.add_html("")
-        self._silent = False
+        self.home: AbstractContextManager[object] = nullcontext()
+        """what all controls lie in"""
+        if folded:
+            self.home = gui.add_folder("What changed, and how to look at it", expand_by_default=False)
+        with self.home:
+            self._add(gui, scenery)
         for handle, what in (
             (self._visit, "visit"),
             (self._wipe, "look"),
@@ -50,6 +48,16 @@ class Panel:
             (self._marks, "marks"),
         ):
             handle.on_update(partial(_heard, on_change, what))
+
+    def _add(self, gui: GuiApi, scenery: Scenery) -> None:
+        self._told = gui.add_html("")
+        self._visit: Any = gui.add_slider("Visit", 0, max(scenery.latest, 1), 1, scenery.latest, hint="0 is before any")
+        self._visit.disabled = scenery.latest == 0
+        self._wipe = gui.add_slider("Before", 0, 100, 1, 0, hint="how much of the picture shows the visit before, in %")
+        self._layer = gui.add_dropdown("Picture", tuple(_LAYERS), hint="what is shown when the camera stands still")
+        self._photos = gui.add_dropdown("Photos", tuple(_PHOTOS), hint="click on one to stand where it was taken")
+        self._marks = gui.add_checkbox("Boxes and numbers", True)
+        self._note = gui.add_html("")
 
     @property
     def visit(self) -> int:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle
 
 _QUALITY = 92  # of our own pictures, as JPEG
+_NARROW = 600  # pixels: controls would cover half of a picture that is no wider
 _EMPTY = 160.0  # units of the stage, about as far as viser's depths reach: where nothing is
 
 
@@ -43,7 +44,7 @@ class Session:
         self._due = True  # the state that is shown has yet to be drawn
         self._sharp, self._closed = False, False
         self._photos: str | None = None
-        self.panel = Panel(client.gui, scenery, self._changed)
+        self.panel = Panel(client.gui, scenery, self._changed, folded=client.camera.image_width < _NARROW)
         self.mover = Mover(client, scenery, self.panel, self._saved)
 
     def open(self) -> None:
