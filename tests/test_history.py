@@ -80,3 +80,15 @@ def test_photos_are_out_of_date_where_only_the_light_changed(tmp_path):
     pixels = was.camera.width * was.camera.height
     view = view_of(now, frame, pixels)  # as taken: the photo and the picture beside it in the old light
     assert np.allclose(view.photo, photo.numpy(), atol=1e-5) and np.allclose(view.rgb, shown[0].numpy(), atol=2e-3)
+
+
+def test_what_stands_in_one_place_is_one_thing():
+    """As where a visit takes back a move: the field before it then knows the thing there already."""
+    box = torch.tensor([[-0.3, -0.3, -0.3], [0.3, 0.3, 0.3]])
+    there, back = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
+    there[0, 3], back[0, 3] = 1.0, -1.0
+    moved = ObjectChange("moved", OccupancyGrid(box, torch.ones(5, 5, 5)), there)
+    again = ObjectChange("moved", OccupancyGrid(box + torch.tensor([2.0, 0, 0]), torch.ones(5, 5, 5)), back)
+    now = UpdatedField(UpdatedField(small_field(), SceneChange((moved,))), SceneChange((again,)))
+    (known,) = known_objects(now)
+    assert torch.allclose(known.grid.tight_aabb().mean(0), torch.tensor([1.0, 0.0, 0.0]), atol=0.05)

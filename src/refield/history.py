@@ -58,11 +58,17 @@ def _grids_now(now: Field) -> list[OccupancyGrid]:
         return []
     known = _grids_now(now.pretrained)
     for o in now.change.objects:
-        centre = o.grid.tight_aabb().mean(0)
-        known = [k for k in known if not bool(k.contains(centre))]
-        if o.grid_now is not None:
-            known.append(o.grid_now)
+        known = [k for k in known if not _holds_middle(k, o.grid)]
+    for o in now.change.objects:
+        there = o.grid_now
+        # one that is known to stand there is the same: the visit took back the move that had led away from there
+        if there is not None and not any(_holds_middle(k, there) for k in known):
+            known.append(there)
     return known
+
+
+def _holds_middle(grid: OccupancyGrid, other: OccupancyGrid) -> bool:
+    return bool(grid.contains(other.tight_aabb().mean(0)))
 
 
 def retouched(capture: Capture, now: Field, folder: Path) -> Capture:
