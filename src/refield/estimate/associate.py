@@ -23,7 +23,7 @@ from refield.estimate.explain import explained_before
 from refield.estimate.hull import Hull, HullConfig, votes
 from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.layers import Sight
-from refield.estimate.light import even_and_grey, log_ratio
+from refield.estimate.light import Ratio
 from refield.estimate.look import Array, View
 from refield.estimate.matched import matched_poses
 from refield.estimate.memory import Memory
@@ -67,7 +67,7 @@ class AssociateConfig:
     arrived: float = 0.5
     """part of a newcomer's pixels that nothing else explains"""
     smallest: float = 0.003
-    """part of a photo that something new, or an object which was overlooked at first, must fill in one at least"""
+    """part of a photo that a thing must fill in one at least; a smaller one is an error of the field, or an edge"""
     # the paper's contour area is 1 %, §10.2.2
     trim: float = 0.03
     """part of an object's voxels that the new photos or the ground deny, from which on it is trimmed"""
@@ -134,7 +134,7 @@ class Fit:
 
 def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> Settled:
     """Find each old object's new place or that it left, and what else arrived."""
-    touched = [k for k, old in enumerate(olds) if changed_share(changed, old) >= ground.believe.touched]
+    touched = [k for k, old in enumerate(olds) if _may_have_changed(ground, changed, old)]
     moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, changed)
     trimmed_some = any(placed[k] is not olds[k] for k in touched)
     olds = [placed.get(k, old) for k, old in enumerate(olds)]
@@ -153,6 +153,12 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
     arrived = [p for p in arrived if fresh(views, ground.hull.lattice, p) >= ground.believe.arrived]
     moved = {k: c for k, c in moved.items() if _noticeable(olds[k], c, ground.believe.still)}
     return Settled(moved, removed, tuple(arrived), tuple(views), tuple(olds))
+
+
+def _may_have_changed(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
+    """Whether an object is to be looked for elsewhere: its pixels changed, and it is no crumb, unless it is known."""
+    crumb = not old.remembered and is_crumb(changed, old, ground.believe.smallest)
+    return not crumb and changed_share(changed, old) >= ground.believe.touched
 
 
 def unexplained(ground: Ground, settled: Settled, part: Voxels) -> bool:
@@ -317,7 +323,7 @@ def _only_light(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
     alike, shown = 0, 0
     for p in past:
         here = shadow_of(p.view, ground.hull.lattice, part) & p.open
-        alike += int((here & even_and_grey(log_ratio(p.view, p.rgb, ground.detect))).sum())
+        alike += int((here & Ratio.of(p.view, p.rgb, ground.detect).even_and_grey).sum())
         shown += int(here.sum())
     return alike > 0.5 * shown
 
