@@ -317,8 +317,8 @@ def _only_light(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
     """Whether a would-be newcomer lies flat on what holds things up and only darkens or brightens it."""
     points = ground.hull.lattice.centres[part]
     extent = float((points.max(0) - points.min(0)).max())
-    heights = [float(np.quantile(plane.height(points), 0.95)) for plane in ground.planes]
-    if not heights or min(heights) > max(5 * ground.hull.lattice.cell, 0.3 * extent):
+    low = max(5 * ground.hull.lattice.cell, 0.3 * extent)
+    if not any((plane.above(points) <= low).mean() >= 0.95 for plane in ground.planes):
         return False
     alike, shown = 0, 0
     for p in past:
@@ -455,7 +455,7 @@ def shown_right(ground: Ground, old: Old, past: Sequence[Past]) -> float:
 def is_sunk(ground: Ground, old: Old, change: PoseChange) -> bool:
     """Whether most of an object would be beneath what holds things up, at its new place."""
     now = transform(change.new_from_old, torch.from_numpy(old.lattice.centres[old.voxels])).numpy()
-    return any((p.height(now) < -2 * _exact(old, p)).mean() > 0.5 for p in ground.planes)
+    return any((p.above(now) < -2 * _exact(old, p)).mean() > 0.5 for p in ground.planes)
 
 
 def _exact(old: Old, plane: Plane) -> float:
@@ -479,7 +479,7 @@ def trimmed(ground: Ground, sight: Sight, change: PoseChange) -> tuple[Old, Pose
     _, against = votes(now, seen, ground.carving)
     never = against > 0
     for plane in ground.planes:
-        height, least = plane.height(now), _exact(old, plane)
+        height, least = plane.above(now), _exact(old, plane)
         if (height < -2 * least).mean() >= ground.believe.trim:  # more than a pose that is not exact
             never |= height < least
     if never.mean() < ground.believe.trim:

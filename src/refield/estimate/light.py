@@ -27,7 +27,8 @@ _EVEN = 0.15  # log units, standard deviation among a pixel and its neighbours
 _GREY = 0.10  # log units by which light changes one channel more than another, however bright it is
 _TINT = 0.5  # and of how much brighter or darker it makes them: half of what leaves one channel as it was
 _AGREE = 0.12  # log units between two views' ratios of the same surface point
-_SAME_PLACE = 0.02  # of the distance
+SAME_PLACE = 0.02
+"""of the distance to a point; so near to it a surface is the one that it is on"""
 _AROUND = 4.0  # blurs; the window in which a photo's detail is compared with the field's
 _ALIKE = 0.5  # of that detail's variance the field's must account for: surfaces of their own share none
 
@@ -62,7 +63,7 @@ def _on_planes(view: View, planes: Sequence[Plane]) -> Mask:
     slack = 2 * view.pixel_angle * np.nan_to_num(view.depth, posinf=0)
     out = np.zeros(view.shape, bool)
     for plane in planes:
-        out |= np.abs(plane.height(points)) < np.maximum(slack, 3 * plane.noise)
+        out |= np.abs(plane.above(points)) < np.maximum(slack, 3 * plane.noise)
     return out
 
 
@@ -127,7 +128,7 @@ def _agreement(i: int, changed: Sequence[Changed], ratios: Sequence[Ratio]) -> t
             continue
         uv, distance, inside = other.view.project(points)
         front = other.view.lookup(other.view.depth, uv, inside)
-        visible = ok & inside & (np.abs(front - distance) < _SAME_PLACE * distance)
+        visible = ok & inside & (np.abs(front - distance) < SAME_PLACE * distance)
         same = np.abs(other.view.lookup(ratios[k].each, uv, inside) - own).max(-1) < _AGREE
         touched = other.view.lookup(pixels.dilate(other.mask, 1), uv, inside)
         asked += visible
