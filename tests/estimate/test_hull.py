@@ -13,7 +13,7 @@ from refield.estimate.hull import HullConfig, find_region
 from refield.estimate.lattice import Lattice, components
 from refield.estimate.look import median_depth, view_of
 from refield.field.volrend import Samples
-from refield.scene.planes import support_planes
+from refield.scene.planes import rough_planes, rough_tops, support_planes
 from tests.estimate.boxes import BoxWorld, camera_at, photograph, standing
 
 CRATE = standing((0.2, 0.17, 0.18), -0.1, -0.1, 20)
@@ -93,3 +93,41 @@ def test_a_crumb_is_small_in_every_photo(monkeypatch, seen, crumb):
     monkeypatch.setattr(associate, "silhouette", silhouette)
     photos = [SimpleNamespace(view=None)] * 2
     assert associate.is_crumb(photos, None, 0.003) is crumb
+
+
+def table_and_floor(count=4000, seed=0):
+    """Points on a table top 1 x 1 at height 0.7 and on the floor beside and around it, seen from above all around."""
+    rng = np.random.default_rng(seed)
+    top = np.concatenate([rng.uniform(-0.5, 0.5, (count, 2)), np.full((count, 1), 0.7)], -1)
+    floor = np.concatenate([rng.uniform(-2, 2, (count, 2)), np.zeros((count, 1))], -1)
+    points = np.concatenate([top, floor])
+    points[:, 2] += 0.003 * rng.normal(size=len(points))
+    around = rng.uniform(0, 2 * np.pi, len(points))
+    eyes = np.stack([2 * np.cos(around), 2 * np.sin(around), np.full(len(points), 1.6)], -1)
+    part = (eyes[:, 2] - 0.7) / (eyes[:, 2] - points[:, 2])  # of the way to where the table's height is met
+    met = eyes + part[:, None] * (points - eyes)
+    hidden = (points[:, 2] < 0.5) & (np.abs(met[:, :2]) < 0.5).all(-1)
+    return points[~hidden].astype(np.float32), eyes[~hidden].astype(np.float32)
+
+
+def test_a_table_top_ends_and_the_floor_is_seen_beside_it():
+    points, eyes = table_and_floor()
+    everything = np.ones(len(points), bool)
+    top = next(p for p in rough_tops(points, eyes, everything, 0.012) if p.offset > 0.5)
+    np.testing.assert_allclose(top.normal, [0, 0, 1], atol=0.02)
+    assert top.offset == pytest.approx(0.7, abs=0.005)
+    asked = np.array([[0, 0, 0.9], [0.4, -0.4, 0.5], [0.9, 0, 0.5], [0, -1.2, 0.9]], np.float32)
+    np.testing.assert_allclose(top.above(asked), [0.2, -0.2, np.inf, np.inf], atol=0.02)
+    assert not any(p.offset > 0.5 for p in rough_planes(points, eyes, 0.012))  # which asks that nothing is beneath
+
+
+def test_what_moved_holds_nothing_up():
+    points, eyes = table_and_floor()
+    still = points[:, 2] < 0.5
+    assert not any(p.offset > 0.5 for p in rough_tops(points, eyes, still, 0.012))
+
+
+def test_a_slice_of_what_fills_space_is_no_plane():
+    points = np.random.default_rng(0).uniform(0, 0.1, (4000, 3)).astype(np.float32)
+    eyes = np.tile(np.array([0.05, 0.05, 3], np.float32), (4000, 1))
+    assert rough_tops(points, eyes, np.ones(4000, bool), 0.004) == []

@@ -23,7 +23,7 @@ from refield.estimate.explain import explained_before
 from refield.estimate.hull import Hull, HullConfig, votes
 from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.layers import Sight
-from refield.estimate.light import even_and_grey, log_ratio
+from refield.estimate.light import Ratio
 from refield.estimate.look import Array, View
 from refield.estimate.matched import matched_poses
 from refield.estimate.memory import Memory
@@ -67,7 +67,7 @@ class AssociateConfig:
     arrived: float = 0.5
     """part of a newcomer's pixels that nothing else explains"""
     smallest: float = 0.003
-    """part of a photo that something new, or an object which was overlooked at first, must fill in one at least"""
+    """part of a photo that a thing must fill in one at least; a smaller one is an error of the field, or an edge"""
     # the paper's contour area is 1 %, §10.2.2
     trim: float = 0.03
     """part of an object's voxels that the new photos or the ground deny, from which on it is trimmed"""
@@ -134,7 +134,7 @@ class Fit:
 
 def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> Settled:
     """Find each old object's new place or that it left, and what else arrived."""
-    touched = [k for k, old in enumerate(olds) if changed_share(changed, old) >= ground.believe.touched]
+    touched = [k for k, old in enumerate(olds) if _may_have_changed(ground, changed, old)]
     moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, changed)
     trimmed_some = any(placed[k] is not olds[k] for k in touched)
     olds = [placed.get(k, old) for k, old in enumerate(olds)]
@@ -153,6 +153,12 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
     arrived = [p for p in arrived if fresh(views, ground.hull.lattice, p) >= ground.believe.arrived]
     moved = {k: c for k, c in moved.items() if _noticeable(olds[k], c, ground.believe.still)}
     return Settled(moved, removed, tuple(arrived), tuple(views), tuple(olds))
+
+
+def _may_have_changed(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
+    """Whether an object is to be looked for elsewhere: its pixels changed, and it is no crumb, unless it is known."""
+    crumb = not old.remembered and is_crumb(changed, old, ground.believe.smallest)
+    return not crumb and changed_share(changed, old) >= ground.believe.touched
 
 
 def unexplained(ground: Ground, settled: Settled, part: Voxels) -> bool:
@@ -311,13 +317,13 @@ def _only_light(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
     """Whether a would-be newcomer lies flat on what holds things up and only darkens or brightens it."""
     points = ground.hull.lattice.centres[part]
     extent = float((points.max(0) - points.min(0)).max())
-    heights = [float(np.quantile(plane.height(points), 0.95)) for plane in ground.planes]
-    if not heights or min(heights) > max(5 * ground.hull.lattice.cell, 0.3 * extent):
+    low = max(5 * ground.hull.lattice.cell, 0.3 * extent)
+    if not any((plane.above(points) <= low).mean() >= 0.95 for plane in ground.planes):
         return False
     alike, shown = 0, 0
     for p in past:
         here = shadow_of(p.view, ground.hull.lattice, part) & p.open
-        alike += int((here & even_and_grey(log_ratio(p.view, p.rgb, ground.detect))).sum())
+        alike += int((here & Ratio.of(p.view, p.rgb, ground.detect).even_and_grey).sum())
         shown += int(here.sum())
     return alike > 0.5 * shown
 
@@ -449,7 +455,7 @@ def shown_right(ground: Ground, old: Old, past: Sequence[Past]) -> float:
 def is_sunk(ground: Ground, old: Old, change: PoseChange) -> bool:
     """Whether most of an object would be beneath what holds things up, at its new place."""
     now = transform(change.new_from_old, torch.from_numpy(old.lattice.centres[old.voxels])).numpy()
-    return any((p.height(now) < -2 * _exact(old, p)).mean() > 0.5 for p in ground.planes)
+    return any((p.above(now) < -2 * _exact(old, p)).mean() > 0.5 for p in ground.planes)
 
 
 def _exact(old: Old, plane: Plane) -> float:
@@ -473,7 +479,7 @@ def trimmed(ground: Ground, sight: Sight, change: PoseChange) -> tuple[Old, Pose
     _, against = votes(now, seen, ground.carving)
     never = against > 0
     for plane in ground.planes:
-        height, least = plane.height(now), _exact(old, plane)
+        height, least = plane.above(now), _exact(old, plane)
         if (height < -2 * least).mean() >= ground.believe.trim:  # more than a pose that is not exact
             never |= height < least
     if never.mean() < ground.believe.trim:

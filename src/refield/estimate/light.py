@@ -1,13 +1,14 @@
 """Light that changed on surfaces that did not: shadows that moved along with their object.
 
-Such a pixel's photo-to-field ratio is near grey and even around it, and every other view that sees the same surface
-point sees the same ratio. What stands in front of the surface fails the second test, what is gone usually the first.
+Such a pixel's photo-to-field ratio is near grey and even around it. Either the photo's fine detail around it is still
+the field's, which nothing that came or left shares with what was there; or every other view that sees the same surface
+point sees the same ratio. What stands in front of the surface fails the latter, what is gone usually the first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -22,24 +23,31 @@ DARK = 0.03
 """linear light, summed over the channels; below it a ratio is noise"""
 LARGEST = 5.0
 """times that light makes a surface brighter or darker, at most"""
+_EVEN = 0.15  # log units, standard deviation among a pixel and its neighbours
 _GREY = 0.10  # log units by which light changes one channel more than another, however bright it is
 _TINT = 0.5  # and of how much brighter or darker it makes them: half of what leaves one channel as it was
 _AGREE = 0.12  # log units between two views' ratios of the same surface point
-_SAME_PLACE = 0.02  # of the distance
+SAME_PLACE = 0.02
+"""of the distance to a point; so near to it a surface is the one that it is on"""
+_AROUND = 4.0  # blurs; the window in which a photo's detail is compared with the field's
+_ALIKE = 0.5  # of that detail's variance the field's must account for: surfaces of their own share none
 
 
 def set_light_aside(changed: Sequence[Changed], planes: Sequence[Plane], config: DetectConfig) -> list[Changed]:
     """The same views with the light changes moved from ``mask`` to ``light``.
 
-    On a support plane one other view that sees the same ratio at the same point is enough, if none shows that point
-    unchanged; elsewhere most of the views must, since an object's own side can look like a shadow.
+    A surface known by its detail needs no other view: the photographer's shadow and what a phone does to parts of a
+    picture are in one photo only. Of the others, on a support plane one other view that sees the same ratio at the
+    same point is enough, if none shows that point unchanged; elsewhere most of the views must, since an object's own
+    side can look like a shadow.
     """
-    ratios = [log_ratio(c.view, c.view.rgb, config) for c in changed]
+    ratios = [Ratio.of(c.view, c.view.rgb, config) for c in changed]
     out = []
     for i, c in enumerate(changed):
         agrees, denies, asked = _agreement(i, changed, ratios)
         flat = _on_planes(c.view, planes) & (denies == 0) & (agrees >= 1)
-        light = c.mask & even_and_grey(ratios[i]) & (flat | (agrees >= np.maximum(2, 0.6 * asked)))
+        there = flat | (agrees >= np.maximum(2, 0.6 * asked)) | same_detail(c.view, config)
+        light = c.mask & ratios[i].even_and_grey & there
         light = cv2.medianBlur(light.astype(np.uint8), 5).astype(bool) & c.mask
         smallest = max(6, config.smallest * light.size)
         rest = c.mask & ~pixels.keep_components(light, 2 * smallest)
@@ -55,24 +63,51 @@ def _on_planes(view: View, planes: Sequence[Plane]) -> Mask:
     slack = 2 * view.pixel_angle * np.nan_to_num(view.depth, posinf=0)
     out = np.zeros(view.shape, bool)
     for plane in planes:
-        out |= np.abs(plane.height(points)) < np.maximum(slack, 3 * plane.noise)
+        out |= np.abs(plane.above(points)) < np.maximum(slack, 3 * plane.noise)
     return out
 
 
-def log_ratio(view: View, rgb: Array, config: DetectConfig) -> Array:
-    """log(photo / rgb) per channel in linear light, (H, W, 3); ``rgb`` is what the field shows, (H, W, 3)."""
+@dataclass(frozen=True)
+class Ratio:
+    """How much more light a photo shows than the field, log units."""
+
+    each: Array
+    """(H, W, 3) of each channel, drawn towards none where there is hardly any light"""
+    mean: Array
+    """(H, W) of all channels"""
+    tint: Array
+    """(H, W, 3) by how much each differs from what it were if all changed alike"""
+
+    @staticmethod
+    def of(view: View, rgb: Array, config: DetectConfig) -> Ratio:
+        """That of a view's photo to ``rgb``, what the field shows there, (H, W, 3)."""
+        sigma = blur_sigma(view, config)
+        photo, shown = (pixels.blur(to_linear(im), sigma) for im in (view.photo, rgb))
+        alike = shown * (photo.sum(-1) / np.maximum(shown.sum(-1), 1e-6))[..., None]
+        each, grey = (np.log((light + DARK / 3) / (shown + DARK / 3)) for light in (photo, alike))
+        tint = each - grey
+        return Ratio(*(a.astype(np.float32) for a in (each, each.mean(-1), tint - tint.mean(-1, keepdims=True))))
+
+    @property
+    def even_and_grey(self) -> Mask:
+        """Pixels whose ratio is near grey, much the same around, and within reason."""
+        spread = cv2.blur(self.mean**2, (3, 3)) - cv2.blur(self.mean, (3, 3)) ** 2
+        even = np.sqrt(np.maximum(spread, 0)) < _EVEN
+        return even & (np.abs(self.tint).max(-1) < tint(self.mean)) & (np.abs(self.mean) < np.log(LARGEST))
+
+
+def same_detail(view: View, config: DetectConfig) -> Mask:
+    """Pixels around which the photo's detail is what the field shows, however bright either is, (H, W)."""
     sigma = blur_sigma(view, config)
-    photo, shown = (pixels.blur(to_linear(im), sigma) for im in (view.photo, rgb))
-    return np.log((photo + DARK / 3) / (shown + DARK / 3)).astype(np.float32)
+    seen, shown = (_detail(pixels.blur(im, sigma), _AROUND * sigma) for im in (view.photo, view.rgb))
+    both, one, other = (pixels.blur(product, _AROUND * sigma) for product in (seen * shown, seen**2, shown**2))
+    return (both > 0) & (both**2 > _ALIKE * one * other)
 
 
-def even_and_grey(ratio: Array) -> Mask:
-    """Pixels whose ratio (H, W, 3) is near grey, much the same around, and within reason."""
-    mean = ratio.mean(-1)
-    chroma = np.abs(ratio - mean[..., None]).max(-1)
-    spread = cv2.blur(mean**2, (3, 3)) - cv2.blur(mean, (3, 3)) ** 2
-    even = np.sqrt(np.maximum(spread, 0)) < 0.15
-    return even & (chroma < tint(mean)) & (np.abs(mean) < np.log(LARGEST))
+def _detail(image: Array, sigma: float) -> Array:
+    """(H, W) log of linear light, beside what it is around."""
+    light = np.log(to_linear(image).sum(-1) + DARK)
+    return (light - pixels.blur(light, sigma)).astype(np.float32)
 
 
 def tint(mean: Array) -> Array:
@@ -80,21 +115,21 @@ def tint(mean: Array) -> Array:
     return _GREY + _TINT * np.abs(mean)
 
 
-def _agreement(i: int, changed: Sequence[Changed], ratios: Sequence[Array]) -> tuple[Array, Array, Array]:
+def _agreement(i: int, changed: Sequence[Changed], ratios: Sequence[Ratio]) -> tuple[Array, Array, Array]:
     """How many other views, at the surface under each pixel, see the same ratio; see no change; see that surface."""
     view = changed[i].view
     points = view.surface.reshape(-1, 3)
     ok = np.isfinite(points).all(-1) & changed[i].mask.ravel()
     points = np.where(ok[:, None], points, 0)
     agrees, denies, asked = (np.zeros(len(points), np.float32) for _ in range(3))
-    own = ratios[i].reshape(-1, 3)
+    own = ratios[i].each.reshape(-1, 3)
     for k, other in enumerate(changed):
         if k == i:
             continue
         uv, distance, inside = other.view.project(points)
         front = other.view.lookup(other.view.depth, uv, inside)
-        visible = ok & inside & (np.abs(front - distance) < _SAME_PLACE * distance)
-        same = np.abs(other.view.lookup(ratios[k], uv, inside) - own).max(-1) < _AGREE
+        visible = ok & inside & (np.abs(front - distance) < SAME_PLACE * distance)
+        same = np.abs(other.view.lookup(ratios[k].each, uv, inside) - own).max(-1) < _AGREE
         touched = other.view.lookup(pixels.dilate(other.mask, 1), uv, inside)
         asked += visible
         agrees += visible & same

@@ -134,7 +134,7 @@ def _free(lattice: Lattice, planes: Sequence[Plane]) -> Voxels:
     """Voxels in front of what holds things up."""
     free = np.ones(lattice.shape, bool)
     for plane in planes:
-        free &= plane.height(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
+        free &= plane.above(lattice.centres) > max(0.25 * lattice.cell, plane.noise)
     return free
 
 

@@ -12,10 +12,11 @@ import torch
 from refield.estimate import associate, detect, hull, light, look
 from refield.estimate.associate import AssociateConfig, Ground, Settled, is_crumb, looks_gone, unexplained
 from refield.estimate.conclude import Told, concluded, disagreeing
-from refield.estimate.detect import Changed, DetectConfig, Errors
+from refield.estimate.detect import Changed, DetectConfig, Errors, Mask
 from refield.estimate.faces import Parts, changed_parts
 from refield.estimate.hull import Hull, HullConfig
 from refield.estimate.lattice import Lattice, Voxels, grown
+from refield.estimate.light import SAME_PLACE
 from refield.estimate.look import Array, View
 from refield.estimate.memory import Memory
 from refield.estimate.models import ModelConfig, Models
@@ -31,7 +32,7 @@ from refield.field.source import Known
 from refield.scene.capture import Capture, Frame, check_capture, check_frames
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
-from refield.scene.planes import Plane, rough_planes
+from refield.scene.planes import Plane, rough_planes, rough_tops
 
 OnStage = Callable[[str], None]
 _MUCH_NEW = 0.02  # of a photo's pixels, from which on it is said that no old photo saw what they show
@@ -206,20 +207,33 @@ def _never_seen(changed: Sequence[Changed]) -> str:
 
 
 def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
-    """What holds things up around the changed pixels."""
+    """What holds things up around the changed pixels, and stayed."""
     near = np.concatenate([c.view.surface[c.mask & np.isfinite(c.view.depth)] for c in changed])
     points = np.concatenate([v.surface.reshape(-1, 3) for v in survey])
-    points = points[np.isfinite(points).all(-1)]
+    eyes = np.repeat([v.centre for v in survey], [v.depth.size for v in survey], 0)
     if len(near) < 20:
         return []
     low, high = np.quantile(near, 0.05, axis=0), np.quantile(near, 0.95, axis=0)
     pad = 0.3 * float((high - low).max())
-    points = points[((points > low - pad) & (points < high + pad)).all(-1)]
-    points = points[np.random.default_rng(0).permutation(len(points))[:6000]]
+    around = np.flatnonzero(((points > low - pad) & (points < high + pad)).all(-1))
+    some = around[np.random.default_rng(0).permutation(len(around))[:6000]]
     depths = [(c.view, c.view.depth[c.mask & np.isfinite(c.view.depth)]) for c in changed]
     sizes = [float(np.median(d)) * v.pixel_angle for v, d in depths if len(d)]
-    cameras = np.stack([v.centre for v in survey])
-    return rough_planes(points, cameras, float(np.median(sizes)))
+    points, eyes, resolved = points[some], eyes[some], float(np.median(sizes))
+    endless = rough_planes(points, np.stack([v.centre for v in survey]), resolved)
+    return endless or rough_tops(points, eyes, _still(points, changed), resolved)
+
+
+def _still(points: Array, changed: Sequence[Changed]) -> Mask:
+    """Which world points (N, 3) on old surfaces a new photo shows as they were, and none otherwise."""
+    shown, touched = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    for c in changed:
+        uv, distance, inside = c.view.project(points)
+        front = c.view.lookup(c.view.depth, uv, inside)
+        seen = inside & (np.abs(front - distance) < SAME_PLACE * distance)
+        shown |= seen
+        touched |= seen & c.view.lookup(c.mask, uv, inside)
+    return shown & ~touched
 
 
 def _carved(scene: _Scene, region: Lattice) -> tuple[Hull, Voxels]:
@@ -229,7 +243,7 @@ def _carved(scene: _Scene, region: Lattice) -> tuple[Hull, Voxels]:
     carved = hull.carve(region, [(c.witness(), c.mask) for c in scene.changed], old, config)
     free = np.ones(region.shape, bool)
     for plane in scene.planes:
-        free &= plane.height(region.centres) > max(0.5 * region.cell, plane.noise)
+        free &= plane.above(region.centres) > max(0.5 * region.cell, plane.noise)
     return carved, free
 
 
