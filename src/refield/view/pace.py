@@ -48,7 +48,7 @@ with their number, and a splat takes as long as 14 points"""
 class Pace:
     """Follows one browser. Times are seconds of any one clock."""
 
-    _step: int = 1
+    _step: int = 0
     _moves: bool = False
     _last: float | None = None
     _count: int = 0
@@ -94,10 +94,12 @@ class Pace:
     def rests(self, now: float) -> bool:
         """The view stands; whether more is to be drawn the next time."""
         self._moves = False
-        more = self._step + 1
-        if more == len(DETAILS) or len(self._times) < _ENOUGH or now < self._not_before.get(more, now):
+        if len(self._times) < _ENOUGH:
             return False
-        if statistics.median(self._times) * DETAILS[more].spare > PICTURE:
-            return False
-        self._step = more
-        return True
+        before, expected = self._step, statistics.median(self._times)
+        while self._step + 1 < len(DETAILS) and now >= self._not_before.get(self._step + 1, now):
+            expected *= DETAILS[self._step + 1].spare
+            if expected > PICTURE:
+                break
+            self._step += 1
+        return self._step > before
