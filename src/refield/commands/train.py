@@ -60,6 +60,10 @@ class Train:
     """of the field: hash, which fits on a CPU in less than a minute; NeRFacto's, for long fits; or that one reduced to
     what a CPU can train in minutes, which heeds no ``nerfacto`` option but the time limit, the seed, and those of the
     photos"""
+    route: Literal["paper", "paper-reduced"] | None = None
+    """what refield update with the same --route needs: the architecture nerfacto, or nerfacto-reduced (a smaller shape,
+    1500 steps of 1024 rays in place of 30000 of 4096), and nothing found out about the photos but what is asked for.
+    Goes before --architecture"""
     fit: FitConfig = OPEN
     nerfacto: NerfactoFitConfig = field(default_factory=NerfactoFitConfig, metadata={"usual": False})
     output: OmitArgPrefixes[Output] = PLAIN
@@ -86,11 +90,15 @@ def _answer(work: Path, psnr: float, clock: Clock) -> Answer:
 
 
 def _config_of(options: Train) -> FitConfig | NerfactoFitConfig:
-    if options.architecture == "hash":
+    long, architecture = options.nerfacto, options.architecture
+    if options.route is not None:
+        architecture = "nerfacto" if options.route == "paper" else "nerfacto-reduced"
+        if long.photos.exposures is None:
+            long = replace(long, photos=replace(long.photos, exposures=False))
+    if architecture == "hash":
         return options.fit
-    long = options.nerfacto
     reduced = replace(REDUCED, max_seconds=long.max_seconds, seed=long.seed, photos=long.photos, size=long.size)
-    return long if options.architecture == "nerfacto" else reduced
+    return long if architecture == "nerfacto" else reduced
 
 
 @dataclass(frozen=True)
