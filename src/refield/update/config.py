@@ -53,6 +53,6 @@ class UpdateConfig:
     seed: int = 0
     route: Literal["refield", "paper", "paper-reduced"] = "refield"
     """refield's own update, which the settings above are of, or the paper's as it gives it, of a field of NeRFacto's
-    shape; paper-reduced: in fewer and smaller steps, for a CPU, whatever ``paper`` says of these"""
+    shape; paper-reduced: in smaller steps, for a CPU, whatever ``paper`` says of these"""
     paper: PaperUpdateConfig = field(default_factory=PaperUpdateConfig)
     """the paper's update"""
