@@ -104,7 +104,8 @@ def test_numbers_of_the_method_are_those_that_are_used() -> None:
     paper, small = PaperUpdateConfig(), reduced(PaperUpdateConfig())
     assert paper.dilation == 2 and "the box twice as large (`--update.paper.dilation`)" in told
     assert f"after {paper.steps} steps of {paper.rays} rays; reduced" in told
-    assert f"{small.steps} of {small.rays}. The paper" in told and f"{small.steps} steps of {small.rays} rays for" in told
+    assert f"{small.steps} of {small.rays}. The paper" in told
+    assert f"{small.steps} steps of {small.rays} rays for the update" in told
     assert f"({fit.steps // 1000} 000 steps of {fit.rays} rays)" in told
     assert f"{REDUCED.steps} steps of {REDUCED.rays} rays" in told
     weights = {FitConfig().distortion, update.distortion}

@@ -1,6 +1,6 @@
-"""The paper's system through the commands: a NeRFacto field, the true change in place of its estimate, the paper's update.
+"""The paper's system through the commands: a NeRFacto field, the true change in place of its estimate, the update.
 
-The shape and the schedules are smaller still than those of `--route paper-reduced`, so that one core does it in a minute.
+Shape and schedules are smaller still than those of `--route paper-reduced`, so that one core does it in a minute.
 """
 
 from __future__ import annotations
