@@ -61,9 +61,9 @@ class Train:
     what a CPU can train in minutes, which heeds no ``nerfacto`` option but the time limit, the seed, and those of the
     photos"""
     route: Literal["paper", "paper-reduced"] | None = None
-    """what refield update with the same --route needs: the architecture nerfacto, or nerfacto-reduced (a smaller shape,
-    1500 steps of 1024 rays in place of 30000 of 4096), and nothing found out about the photos but what is asked for.
-    Goes before --architecture"""
+    """what refield update with the same option wants, whatever ``architecture`` says: nerfacto or, reduced, half of its
+    levels and width, fewer samples, and 1500 steps of 1024 rays for 30000 of 4096; of the photos nothing is found out
+    but what is asked for"""
     fit: FitConfig = OPEN
     nerfacto: NerfactoFitConfig = field(default_factory=NerfactoFitConfig, metadata={"usual": False})
     output: OmitArgPrefixes[Output] = PLAIN

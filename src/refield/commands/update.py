@@ -46,9 +46,8 @@ class Update:
     photos: Annotated[Path, arg(metavar="PHOTOS"), Positional]
     """the new photos: their folder; or a transforms.json or its folder, with poses in the world of the old ones"""
     route: Literal["refield", "paper", "paper-reduced"] | None = None
-    """refield's own steps throughout, or the paper's (its estimate and its update, of a workspace that refield train
-    made with the same --route; docs/method.md); paper-reduced: with an update that a CPU can do in minutes. Goes before
-    --estimate.route and --update.route, which choose for one half each"""
+    """the steps of refield or, in a workspace that refield train made with the same option, those of the paper;
+    paper-reduced: with fewer rays, for a CPU. Sets both estimate.route and update.route, which choose one half each"""
     evaluation: Path | None = None
     """a folder of further photos (transforms.json, images/, masks_in/, masks_out/) to measure by"""
     exit_code: Annotated[bool, FlagCreatePairsOff] = False
