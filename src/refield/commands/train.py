@@ -57,13 +57,10 @@ class Train:
     poses: FromPhotosConfig = field(default_factory=FromPhotosConfig)
     """photos without poses: how they are taken in, and how their poses are found"""
     architecture: Literal["hash", "nerfacto", "nerfacto-reduced"] = "hash"
-    """of the field: hash, which fits on a CPU in less than a minute; NeRFacto's, for long fits; or that one reduced to
-    what a CPU can train in minutes, which heeds no ``nerfacto`` option but the time limit, the seed, and those of the
-    photos"""
+    """of the field: hash, which fits on a CPU in less than a minute; NeRFacto, for long fits; or that one reduced to
+    what a CPU can train in minutes (heeds the limit, seed and photos of ``nerfacto``)"""
     route: Literal["paper", "paper-reduced"] | None = None
-    """what refield update with the same option wants, whatever ``architecture`` says: nerfacto or, reduced, half of its
-    levels and width, fewer samples, and 1500 steps of 1024 rays for 30000 of 4096; of the photos nothing is found out
-    but what is asked for"""
+    """as refield update wants it with the same option: nerfacto, or that reduced; exposures are not sought"""
     fit: FitConfig = OPEN
     nerfacto: NerfactoFitConfig = field(default_factory=NerfactoFitConfig, metadata={"usual": False})
     output: OmitArgPrefixes[Output] = PLAIN
