@@ -26,8 +26,9 @@ PROPOSALS = {"0.samples": 64, "1.samples": 32, "0.log2-table": 14, "1.log2-table
 FIT = {"steps": 600, "rays": 1024, "decay-steps": 600}
 FIT |= {f"field.{k}": v for k, v in SHAPE.items()} | {f"field.proposals.{k}": v for k, v in PROPOSALS.items()}
 UPDATE = {"steps": 300, "rays": 1024, "decay-steps": 300}
-FLOORS = {"psnr_in": 0.0, "psnr_out": 0.0}
-GAINED = {"psnr_in": 0.0, "psnr_out": 0.0}
+# dB. Two runs on 2026-11-23 (one thread) gave 21.30 in and 21.44 out, before 14.3 and 14.6
+FLOORS = {"psnr_in": 20.5, "psnr_out": 20.5}
+GAINED = 5.0
 
 
 def given(prefix: str, options: dict[str, float]) -> list[str]:
@@ -49,7 +50,7 @@ def test_the_papers_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
     told = json.loads(capsys.readouterr().out)
     scores, before = told["evaluation"]["pooled"], told["evaluation"]["pooled_before"]
     for name, least in FLOORS.items():
-        assert scores[name] > max(least, before[name] + GAINED[name]), (scores, before)
+        assert scores[name] > max(least, before[name] + GAINED), (scores, before)
     assert scores["psnr_untouched"] > before["psnr_untouched"] - 3
     assert main(["evaluate", work, str(tmp_path / "eval"), "--json"]) == 0  # what was kept is what was measured
     assert json.loads(capsys.readouterr().out)["pooled"]["psnr"] == pytest.approx(scores["psnr"])
