@@ -308,6 +308,19 @@ def test_a_second_visit_builds_on_the_first(scene: tuple[Capture, SceneChange], 
     assert [tuple(k.grid.aabb.shape) for k in known_objects(twice)] == [(2, 3)]
 
 
+def test_refields_own_update_builds_on_it(scene: tuple[Capture, SceneChange], tmp_path: Path) -> None:
+    capture, old, change = _args(scene)
+    once = update_field_paper(capture, old, change, FEW)
+    on = SceneChange((ObjectChange("moved", grid_of(Ball(THERE, BALL.radius)), at(-0.2, -1.0, 0.1)),), by_hand=True)
+    twice = update_field(capture, once, on)
+    assert isinstance(twice, UpdatedField) and twice.pretrained is once
+    save_updated(tmp_path, twice)
+    rays = some_rays()
+    assert torch.equal(render_rays(twice, rays).rgb, render_rays(load_updated(tmp_path, once, on), rays).rgb)
+    with pytest.raises(InputError, match="refield undo"):
+        update_field_paper(capture, twice, change, FEW)
+
+
 # --- the commands' options --------------------------------------------------------------------------------------------
 
 
