@@ -18,6 +18,7 @@ from refield.cli import COMMANDS
 from refield.field.fit import FitConfig
 from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig
 from refield.update.config import UpdateConfig
+from refield.update.paper.config import PaperUpdateConfig, reduced
 from refield.update.train import _RING_RAYS
 from tests.reach import reached
 
@@ -100,6 +101,11 @@ def test_numbers_of_the_method_are_those_that_are_used() -> None:
     assert f"{update.steps} steps at most" in told
     assert f"the paper's {update.shadow:g} and {update.far:g} of the width" in told
     assert f"of what they leave {_RING_RAYS // 1000} 000 rays" in told
+    paper, small = PaperUpdateConfig(), reduced(PaperUpdateConfig())
+    assert paper.dilation == 2 and "the box twice as large (`--update.paper.dilation`)" in told
+    assert f"after {paper.steps} steps of {paper.rays} rays; reduced" in told
+    assert f"{small.steps} of {small.rays}. The paper" in told
+    assert f"{small.steps} steps of {small.rays} rays for the update" in told
     assert f"({fit.steps // 1000} 000 steps of {fit.rays} rays)" in told
     assert f"{REDUCED.steps} steps of {REDUCED.rays} rays" in told
     weights = {FitConfig().distortion, update.distortion}
@@ -113,8 +119,8 @@ def test_what_nobody_runs_is_found_to_be_so() -> None:
     assert ("update.composite", "UpdatedField._route") in run  # a method, of something built elsewhere
     assert ("field.kernels.cpu.step", "train_step") in run  # a twin, chosen by device
     assert ("commands.undo", "run") in run
+    assert ("field.warp", "two_way") in run  # by the paper's route alone
     tests_alone = {
-        ("field.warp", "two_way"),
         ("synthetic.oracles", "AnalyticField"),
         ("scene.similarity", "similarity"),
     }

@@ -5,6 +5,7 @@ Every visit that changed something wraps the field before it; an updated field i
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +22,8 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
 from refield.scene.images import frame_image, scaled_image, write_image
-from refield.update.composite import UpdatedField, layers_of, source_of
+from refield.update.composite import UpdatedField, source_of
+from refield.update.paper.field import PaperField
 from refield.update.store import load_updated
 from refield.workspace import Workspace
 
@@ -54,7 +56,7 @@ def known_objects(now: Field) -> list[Known]:
 
 def _grids_now(now: Field) -> list[OccupancyGrid]:
     """Of all objects that visits found, where they are."""
-    if not isinstance(now, UpdatedField):
+    if not isinstance(now, UpdatedField | PaperField):
         return []
     known = _grids_now(now.pretrained)
     for o in now.change.objects:
@@ -71,15 +73,22 @@ def _holds_middle(grid: OccupancyGrid, other: OccupancyGrid) -> bool:
     return bool(grid.contains(other.tight_aabb().mean(0)))
 
 
+def _layers(now: Field) -> Iterator[UpdatedField | PaperField]:
+    """The updates that a field has had by either route, the latest first."""
+    while isinstance(now, UpdatedField | PaperField):
+        yield now
+        now = now.pretrained
+
+
 def retouched(capture: Capture, now: Field, folder: Path) -> Capture:
     """The capture as if taken ``now``: where the photos show what has changed since, the field's own stand.
 
     The photos are from before any visit; an update must not learn from them what an earlier one has put right. Each is
     written as a PNG into ``folder`` when it is first looked at: few are, where every object is known.
     """
-    updates = list(layers_of(now))
+    updates = list(_layers(now))
     shapes = tuple(box for update in updates for box in update.boxes)
-    lights = tuple(update.light.aabb for update in updates if update.light is not None)
+    lights = tuple(u.light.aabb for u in updates if isinstance(u, UpdatedField) and u.light is not None)
     if not shapes and not lights:
         return capture
     before = updates[-1].pretrained

@@ -69,8 +69,8 @@ def test_two_way_is_its_own_inverse_off_the_overlap(shift: list[float], yaw: flo
     new_from_old = pose.exp(torch.tensor([*shift, 0, 0, yaw], dtype=torch.float64))
     move = Move(ball((0.3, -0.2, 0.1), 0.4), new_from_old)
     x, d = points(half=3.0)
-    once = two_way(x, d, move)
-    twice = two_way(*once, move)
+    once = two_way(x, d, (move,))
+    twice = two_way(*once, (move,))
     # on the overlap a point of the new place asks inside the old place that is new place too
     overlap = move.grid.contains(x) & move.arrived(x)
     chained = move.arrived(once[0]) & move.grid.contains(once[0])
@@ -89,7 +89,7 @@ def test_move_in_wins_over_two_way_exchange() -> None:
     both = move.arrived(x) & move.grid.contains(x)
     assert both.any()
     one_way, _, _ = move_in(x, d, (move,))
-    torch.testing.assert_close(two_way(x, d, move)[0][both], one_way[both])
+    torch.testing.assert_close(two_way(x, d, (move,))[0][both], one_way[both])
 
 
 def test_the_pose_can_be_refined_through_the_warp() -> None:

@@ -57,9 +57,10 @@ class Train:
     poses: FromPhotosConfig = field(default_factory=FromPhotosConfig)
     """photos without poses: how they are taken in, and how their poses are found"""
     architecture: Literal["hash", "nerfacto", "nerfacto-reduced"] = "hash"
-    """of the field: hash, which fits on a CPU in less than a minute; NeRFacto's, for long fits; or that one reduced to
-    what a CPU can train in minutes, which heeds no ``nerfacto`` option but the time limit, the seed, and those of the
-    photos"""
+    """of the field: hash, which fits on a CPU in less than a minute; NeRFacto, for long fits; or that one reduced to
+    what a CPU can train in minutes (heeds the limit, seed and photos of ``nerfacto``)"""
+    route: Literal["paper", "paper-reduced"] | None = None
+    """as refield update wants it with the same option: nerfacto, or that reduced; exposures are not sought"""
     fit: FitConfig = OPEN
     nerfacto: NerfactoFitConfig = field(default_factory=NerfactoFitConfig, metadata={"usual": False})
     output: OmitArgPrefixes[Output] = PLAIN
@@ -86,11 +87,15 @@ def _answer(work: Path, psnr: float, clock: Clock) -> Answer:
 
 
 def _config_of(options: Train) -> FitConfig | NerfactoFitConfig:
-    if options.architecture == "hash":
+    long, architecture = options.nerfacto, options.architecture
+    if options.route is not None:
+        architecture = "nerfacto" if options.route == "paper" else "nerfacto-reduced"
+        if long.photos.exposures is None:
+            long = replace(long, photos=replace(long.photos, exposures=False))
+    if architecture == "hash":
         return options.fit
-    long = options.nerfacto
     reduced = replace(REDUCED, max_seconds=long.max_seconds, seed=long.seed, photos=long.photos, size=long.size)
-    return long if options.architecture == "nerfacto" else reduced
+    return long if architecture == "nerfacto" else reduced
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
@@ -33,6 +33,7 @@ _SURE = 10.0  # seconds
 EXAMPLES = (
     "refield update work after",
     "refield update work after --exit-code --json > change.json",
+    "refield update work after --route paper-reduced",
 )
 
 
@@ -44,6 +45,9 @@ class Update:
     """the workspace"""
     photos: Annotated[Path, arg(metavar="PHOTOS"), Positional]
     """the new photos: their folder; or a transforms.json or its folder, with poses in the world of the old ones"""
+    route: Literal["refield", "paper", "paper-reduced"] | None = None
+    """the steps of refield or, in a workspace that refield train made with the same option, those of the paper;
+    paper-reduced: with fewer rays, for a CPU. Sets both estimate.route and update.route, which choose one half each"""
     evaluation: Path | None = None
     """a folder of further photos (transforms.json, images/, masks_in/, masks_out/) to measure by"""
     exit_code: Annotated[bool, FlagCreatePairsOff] = False
@@ -90,12 +94,20 @@ def facts_of(work: Path, visit: Visit) -> dict[str, Any]:
     }
 
 
+def _by_route(options: Update) -> tuple[EstimateConfig, UpdateConfig]:
+    """How to estimate and how to update, ``--route`` first."""
+    if options.route is None:
+        return options.estimate, options.update
+    estimate = replace(options.estimate, route="refield" if options.route == "refield" else "paper")
+    return estimate, replace(options.update, route=options.route)
+
+
 def update(options: Update, clock: Clock, facts: Mapping[str, float | str] | None = None) -> Visit:
     """One visit, see `refield.visits.make.make_visit`.
 
     Raises:
         InputError: no workspace, or unusable photos.
     """
-    config = VisitConfig(options.intake, options.localize, options.estimate, options.update)
+    config = VisitConfig(options.intake, options.localize, *_by_route(options))
     workspace = Workspace.open(options.work)
     return make_visit(workspace, options.photos, clock, config, evaluation=options.evaluation, facts=facts)

@@ -63,7 +63,7 @@ class EstimateConfig:
     """refinement of poses through the field"""
     associate: AssociateConfig = field(default_factory=AssociateConfig)
     """what is believed"""
-    route: Literal["refield", "paper"] = field(default="refield", metadata={"usual": True})
+    route: Literal["refield", "paper"] = "refield"
     """refield's own steps, or those of the paper as it gives them (``estimate.paper``)"""
     paper: PaperConfig = field(default_factory=PaperConfig)
     """the paper's route"""

@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field
-from typing import Any, Literal, cast
+from typing import Any, Literal, Protocol, cast
 
 import torch
 from torch import Tensor
 
-from refield.field import kernels
 from refield.field.descent import MOST_SKIPPED, NonFiniteError
 from refield.field.fit import FitProgress, Fitted, ProgressCallback, rate_factor
 from refield.field.interlevel import interlevel_loss
 from refield.field.kernels.reference import Batch, Stepped, compared
-from refield.field.losses import colour_loss, scale_gradients
+from refield.field.losses import colour_loss, distortion_loss, scale_gradients
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
 from refield.field.photo_size import PhotoSizeConfig, as_read, at_full_size
@@ -226,7 +225,7 @@ class _NerfactoFit:
         w = weights(sigmas, samples)
         shown = self._shown(w, rgbs, samples)
         errors = compared(shown, batch)
-        loss = colour_loss(errors, batch.trust) + config.distortion * _distortion(w, edges, samples)
+        loss = colour_loss(errors, batch.trust) + config.distortion * distortion_loss(w, edges, samples)
         with torch.no_grad():
             cells = model.sampler.cells(x.detach())
             each = w.reshape(len(edges), -1)
@@ -257,18 +256,27 @@ class _NerfactoFit:
             )
 
 
-def rate_at(step: int, config: NerfactoFitConfig) -> float:
+class Schedule(Protocol):
+    """How fast a field and its proposal networks learn, step by step; see `NerfactoFitConfig`."""
+
+    @property
+    def rate(self) -> float: ...
+    @property
+    def final_rate(self) -> float: ...
+    @property
+    def decay_steps(self) -> int: ...
+    @property
+    def proposal_every(self) -> int: ...
+    @property
+    def proposal_warmup(self) -> int: ...
+
+
+def rate_at(step: int, config: Schedule) -> float:
     """Adam's learning rate: exponentially from ``rate`` to ``final_rate``, then constant."""
     return config.rate * (config.final_rate / config.rate) ** min(step / config.decay_steps, 1.0)
 
 
-def proposal_interval(step: int, config: NerfactoFitConfig) -> float:
+def proposal_interval(step: int, config: Schedule) -> float:
     """Steps from one of the proposals' own steps to the next: from 1 to ``proposal_every`` over the warm-up."""
     share = min(step / config.proposal_warmup, 1.0) if config.proposal_warmup else 1.0
     return max(1.0, share * config.proposal_every)
-
-
-def _distortion(w: Tensor, edges: Tensor, samples: Samples) -> Tensor:
-    """Mean of mip-NeRF 360's Eq. 15 over the rays, in s, so that far haze counts as near haze does."""
-    starts, ends = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
-    return kernels.distortion(w, starts, ends, samples.ray_offsets).mean()

@@ -1,9 +1,10 @@
-"""What a field is fitted to: colour (Eq. 2); gradient scaling (§10.1)."""
+"""What a field is fitted to: colour (Eq. 2), distortion; gradient scaling (§10.1)."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
+from refield.field import kernels
 from refield.field.kernels.reference import scale_gradient
 from refield.field.volrend import Samples
 
@@ -18,3 +19,12 @@ def scale_gradients(sigmas: Tensor, rgbs: Tensor, samples: Samples, unit: float)
     mid = (samples.t_starts + samples.t_ends) / 2
     scale = (mid / unit).square().clamp(max=1.0)
     return scale_gradient(sigmas, scale), scale_gradient(rgbs, scale)
+
+
+def distortion_loss(w: Tensor, edges: Tensor, samples: Samples) -> Tensor:
+    """Mean of mip-NeRF 360's Eq. 15 over N rays, in s, so that far haze counts as near haze does.
+
+    Weights (N * K,) of the ``samples`` between edges (N, K + 1) -> ().
+    """
+    starts, ends = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
+    return kernels.distortion(w, starts, ends, samples.ray_offsets).mean()

@@ -118,11 +118,11 @@ class NerfactoField(nn.Module):
     @property
     def densities(self) -> tuple[Density, ...]:
         """What the proposal networks take the density to be, at world points (S, 3)."""
+        return tuple(self.told_by(p) for p in self.proposals)
 
-        def asking(network: nn.Module) -> Density:
-            return lambda x: self._sigma(network(self._contracted(x))[:, 0])
-
-        return tuple(asking(p) for p in self.proposals)
+    def told_by(self, network: nn.Module) -> Density:
+        """What a proposal network, the field's own or a copy of it, takes the density to be."""
+        return lambda x: self._sigma(network(self._contracted(x))[:, 0])
 
     def propose(
         self, rays: Rays, jitter: bool = False, anneal: float = 1.0, densities: tuple[Density, ...] | None = None

@@ -72,15 +72,17 @@ def owners(x: Tensor, moves: tuple[Move, ...]) -> Tensor:
     return owner
 
 
-def two_way(x: Tensor, d: Tensor, move: Move) -> tuple[Tensor, Tensor]:
-    """Eq. 16: the new place asks at the old one, and the old place at the new one (§10.1.2); move-in wins.
+def two_way(x: Tensor, d: Tensor, moves: tuple[Move, ...]) -> tuple[Tensor, Tensor]:
+    """Eq. 16 for any number of objects: a new place asks at the old one, and an old place at the new one (§10.1.2).
 
-    World points and directions (S, 3) -> (S, 3), (S, 3). Its own inverse where the two places do not overlap.
+    Move-in wins, and of two objects the first. World points and directions (S, 3) -> (S, 3), (S, 3). Its own inverse
+    where no places overlap.
     """
-    in_new = move.arrived(x)
-    in_old = move.grid.contains(x.detach()) & ~in_new
-    owner = torch.where(in_new, 0, torch.where(in_old, 1, -1))
-    return looked_up(x, d, owner, [move.old_from_new, move.new_from_old])
+    x, d, came = move_in(x, d, moves)
+    left = torch.full_like(came, -1)
+    for i, move in enumerate(moves):
+        left[move.grid.contains(x) & (came < 0) & (left < 0)] = i
+    return looked_up(x, d, left, [m.new_from_old for m in moves])
 
 
 def looked_up(x: Tensor, d: Tensor, owner: Tensor, poses: list[Tensor]) -> tuple[Tensor, Tensor]:

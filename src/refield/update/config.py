@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
+
+from refield.update.paper.config import PaperUpdateConfig
 
 
 @dataclass(frozen=True)
@@ -48,3 +51,8 @@ class UpdateConfig:
     least_gain: float = 0.03
     """dB"""
     seed: int = 0
+    route: Literal["refield", "paper", "paper-reduced"] = "refield"
+    """refield's own update, which the settings above are of, or the paper's as it gives it, of a field of NeRFacto's
+    shape; paper-reduced: in smaller steps, for a CPU, whatever ``paper`` says of these"""
+    paper: PaperUpdateConfig = field(default_factory=PaperUpdateConfig)
+    """the paper's update"""

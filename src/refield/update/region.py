@@ -63,6 +63,20 @@ class Region:
         return replace(empty, grid=grid)
 
 
+def region_out(name: str, region: Region) -> dict[str, Tensor]:
+    """A region's grids as named tensors."""
+    out: dict[str, Tensor] = {}
+    for i, grid in enumerate(region.grids):
+        out |= {f"{name}.{i}.aabb": grid.aabb.clone(), f"{name}.{i}.values": grid.values.clone()}
+    return out
+
+
+def region_in(name: str, count: int, tensors: dict[str, Tensor]) -> Region:
+    """Inverse of :func:`region_out`. Raises KeyError if a grid is missing."""
+    keys = [f"{name}.{i}" for i in range(count)]
+    return Region(tuple(OccupancyGrid(tensors[f"{k}.aabb"], tensors[f"{k}.values"]) for k in keys))
+
+
 def finer(sampler: OccupancySampler) -> OccupancySampler:
     """A sampler that looks where another does, with the shorter samples of what changed.
 

@@ -12,23 +12,27 @@ from torch import Tensor
 from refield.artefacts import read_tensors, write_tensors
 from refield.field.radiance import Field, HashField
 from refield.field.stored import occupancy_in, sampler_out
-from refield.scene.change import OccupancyGrid, SceneChange
+from refield.scene.change import SceneChange
 from refield.scene.errors import InputError
 from refield.update.composite import Earlier, Origin, UpdatedField
 from refield.update.light import Relighting
+from refield.update.paper.field import PaperField
+from refield.update.paper.store import paper_from_state, paper_state
 from refield.update.recall import ground_of, without
-from refield.update.region import Region
+from refield.update.region import region_in, region_out
 from refield.update.textured import TexturedPlane
 
 _REMEDY = "restore the visit, or remove it and update again"
 
 
-def save_updated(folder: Path, field: UpdatedField) -> None:
+def save_updated(folder: Path, field: UpdatedField | PaperField) -> None:
     """Write ``field.safetensors`` and ``field.json``.
 
     Raises:
         TypeError: the helper is no `HashField`, so there is no file for it.
     """
+    if isinstance(field, PaperField):
+        return write_tensors(folder, *paper_state(field))
     tensors: dict[str, Tensor] = sampler_out(field.sampler)
     facts: dict[str, Any] = {
         "architecture": "UpdatedField",
@@ -36,12 +40,12 @@ def save_updated(folder: Path, field: UpdatedField) -> None:
         "bare": len(field.bare.grids),
         "helper": None,
     }
-    tensors |= _region_out("region", field.region) | _region_out("bare", field.bare)
+    tensors |= region_out("region", field.region) | region_out("bare", field.bare)
     facts["planes"] = len(field.region.planes)
     for i, plane in enumerate(field.region.planes):
         tensors |= _plane_out(f"plane.{i}", plane)
     for name, known in (("places", field.earlier.places), ("unknown", field.earlier.unknown)):
-        tensors |= _region_out(name, known)
+        tensors |= region_out(name, known)
         facts[name] = len(known.grids)
     facts["undone"] = [[o.object, o.layer, o.index] for o in field.earlier.undone]
     facts["left"] = [[o.object, o.layer, o.index] for o in field.earlier.left]
@@ -60,7 +64,7 @@ def save_updated(folder: Path, field: UpdatedField) -> None:
     write_tensors(folder, tensors, facts)
 
 
-def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> UpdatedField:
+def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> UpdatedField | PaperField:
     """The updated field that `save_updated` wrote, over the field and the change that it was made from.
 
     Moves that it took back are taken back again.
@@ -70,12 +74,14 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
     """
     tensors, facts = read_tensors(folder)
     try:
-        region = _region_in("region", facts["regions"], tensors)
+        if facts["architecture"] == "PaperField":
+            return paper_from_state(tensors, facts, pretrained, change)
+        region = region_in("region", facts["regions"], tensors)
         planes = tuple(
             _plane_in(f"plane.{i}", tensors) for i in range(facts.get("planes", 0))
         )  # older visits have none
         region = replace(region, planes=planes)
-        bare = _region_in("bare", facts["bare"], tensors)
+        bare = region_in("bare", facts["bare"], tensors)
         light = _light_in("light", tensors)
         shading = tuple(_light_in(f"shading.{i}", tensors) for i in range(facts["shading"]))
         own = {name.removeprefix("helper."): t for name, t in tensors.items() if name.startswith("helper.")}
@@ -108,20 +114,8 @@ def _earlier_in(tensors: dict[str, Tensor], facts: dict[str, Any], field: Field)
     undone, left = (tuple(Origin(*map(int, o)) for o in facts.get(name, ())) for name in ("undone", "left"))
     for origin in undone:
         field = without(field, origin, departed=False)
-    places, unknown = (_region_in(name, facts.get(name, 0), tensors) for name in ("places", "unknown"))
+    places, unknown = (region_in(name, facts.get(name, 0), tensors) for name in ("places", "unknown"))
     return field, Earlier(undone, left, places, ground_of(field, left), unknown)
-
-
-def _region_out(name: str, region: Region) -> dict[str, Tensor]:
-    out: dict[str, Tensor] = {}
-    for i, grid in enumerate(region.grids):
-        out |= {f"{name}.{i}.aabb": grid.aabb.clone(), f"{name}.{i}.values": grid.values.clone()}
-    return out
-
-
-def _region_in(name: str, count: int, tensors: dict[str, Tensor]) -> Region:
-    keys = [f"{name}.{i}" for i in range(count)]
-    return Region(tuple(OccupancyGrid(tensors[f"{k}.aabb"], tensors[f"{k}.values"]) for k in keys))
 
 
 def _plane_out(name: str, plane: TexturedPlane) -> dict[str, Tensor]:

@@ -29,6 +29,9 @@ from refield.update.frozen import Segments, composite_once
 from refield.update.ground import Foothold, footholds, planes_around
 from refield.update.helper import new_helper, step_near
 from refield.update.light import Relighting, Sightings, fit_light
+from refield.update.paper.config import reduced
+from refield.update.paper.field import PaperField
+from refield.update.paper.route import update_field_paper
 from refield.update.recall import earlier_of
 from refield.update.region import Region, finer, meets, move_out, without_planes
 from refield.update.spared import spared
@@ -55,19 +58,23 @@ def update_field(
     config: UpdateConfig = DEFAULTS,
     on_stage: Callable[[str], None] | None = None,
     on_progress: Callable[[UpdateProgress], None] | None = None,
-) -> UpdatedField:
+) -> UpdatedField | PaperField:
     """The field of the changed scene; ``field`` itself is not touched.
 
     ``capture`` holds the old photos, ``change`` what changed and the new photos; without new photos the old objects
     are cut out and the moved ones moved. ``on_stage`` hears the name of each stage as it begins.
 
     Raises:
+        InputError: the paper's route cannot take the field, or has no new photos (`update_field_paper`).
         NonFiniteError: the helper's loss was not finite for 20 steps in a row before its first look; after one, the
             best state is kept and ``why_stopped`` says so.
     """
     check_capture(capture)
     check_field(field)
     expect("the change", change, SceneChange, "a SceneChange, as refield.estimate_change makes one")
+    if config.route != "refield":
+        asked = config.paper if config.route == "paper" else reduced(config.paper)
+        return update_field_paper(capture, field, change, asked, on_stage, on_progress)
     say = on_stage or (lambda name: None)
     torch.manual_seed(config.seed)
     say("move")

@@ -26,6 +26,8 @@ from refield.scene.images import frame_image
 from refield.scene.load import is_posed, load_new_photos
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
+from refield.update.paper.field import PaperField
+from refield.update.paper.route import need_nerfacto
 from refield.update.store import save_updated
 from refield.update.train import update_field
 from refield.visits.page import page
@@ -88,6 +90,8 @@ def make_visit(
         telling.stage("load the field")
         number = workspace.visits
         old = state(workspace, number)
+        if config.update.route != "refield":
+            need_nerfacto(old, workspace.path)
         capture = retouched(capture, old, Path(scratch))
         known = known_objects(old)
         change = estimate_change(
@@ -159,7 +163,7 @@ def _need_a_photo(photos: Path | Sequence[Frame], change: SceneChange) -> None:
 
 def _updated(
     capture: Capture, old: Field, change: SceneChange, config: UpdateConfig, telling: Telling
-) -> UpdatedField | None:
+) -> UpdatedField | PaperField | None:
     """The updated field, None if nothing changed."""
     if not change.objects:
         return None
