@@ -202,6 +202,25 @@ def test_an_object_behind_everything_is_not_shown_and_breaks_nothing(stage):
     assert found is None or found.explained == 0
 
 
+def test_what_a_placed_object_hides_speaks_neither_for_nor_against_another(stage):
+    """Half of each photo around the object shows a wall that was placed before it."""
+    alone = refine(Sight(BEFORE, stage.old, stage.past, [stage.old]), TRUE)
+    place = transform(TRUE, torch.from_numpy(stage.old.centre).double()).float().numpy()
+    hidden = []
+    for p in stage.past:
+        u = int(p.view.project(place)[0][0])
+        covered, depth = np.zeros(p.view.shape, bool), p.depth.copy()
+        covered[:, u:], depth[:, u:] = True, 0.3
+        hidden.append(replace(p, covered=covered, depth=depth))
+    ready = layers_at(Sight(BEFORE, stage.old, hidden, [stage.old]), TRUE, 12_000)
+    half = refine(Sight(BEFORE, stage.old, hidden, [stage.old]), TRUE)
+    assert 0.3 * alone.pixels < half.pixels < 0.7 * alone.pixels
+    assert half.explained > 0.9
+    for crop, shown in zip(ready.crops, ready.show(TRUE)):
+        assert shown.hidden.any() and not shown.hidden.all()
+        assert not (ready.sides(crop, shown, TRUE)[shown.hidden.numpy()] >= 0).any()
+
+
 def test_the_outline_of_a_moved_object_is_whole_in_photos_larger_than_the_working_size(stage):
     config = recipe.EstimateConfig(survey=6, max_pixels=1200)
     small = recipe._detected(stage.capture, BEFORE, stage.frames, config, Models())

@@ -65,6 +65,8 @@ class Crop:
     """(n,) Lab units"""
     beyond: Tensor
     """(n,) depth of the old field without the objects that left, no finer than the working size"""
+    placed: Tensor
+    """(n,) depth of the objects that were placed already, as fine; inf where none is"""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -83,6 +85,8 @@ class Layer:
     depth: Tensor
     behind: Tensor
     """(n, 3) what the old field shows without the objects"""
+    hidden: Tensor
+    """(n,) bool: an object that was placed already stands in front, and the photo shows that"""
 
 
 @dataclass(frozen=True)
@@ -154,13 +158,14 @@ class Layers:
         """The moved object over the fixed background, per crop (Eqs. 1, 3)."""
         alone = object_alone(self.sight.field, self.old, self._rays, new_from_old, self._sampler)
         behind, beyond = self._behind
-        front = self._in_front(alone, beyond)
+        hidden = torch.cat([c.placed for c in self.crops]) < alone.depth
+        front = self._in_front(alone, beyond) & ~hidden
         opacity = torch.where(front, alone.opacity, torch.zeros_like(alone.opacity))
         own = torch.where(front[:, None], alone.rgb, torch.zeros_like(alone.rgb))
         if self.sight.detail is not None:
             own = own + self._lacking(self.sight.detail, opacity, alone.depth, new_from_old)
         rgb = own + (1 - opacity)[:, None] * behind
-        parts = (t.split(self._sizes) for t in (rgb, own, opacity, alone.depth, behind))
+        parts = (t.split(self._sizes) for t in (rgb, own, opacity, alone.depth, behind, hidden))
         return [Layer(*p) for p in zip(*parts)]
 
     def cover(self, new_from_old: Tensor) -> list[Tensor]:
@@ -266,4 +271,5 @@ def _crop(index: int, p: Past, camera: Camera, box: tuple[int, int, int, int]) -
         torch.from_numpy(p.known[pick].reshape(-1)),
         torch.from_numpy(p.changed.threshold[pick].reshape(-1)),
         torch.from_numpy(p.beyond[pick].reshape(-1)),
+        torch.from_numpy(np.where(p.covered, p.depth, np.inf).astype(np.float32)[pick].reshape(-1)),
     )

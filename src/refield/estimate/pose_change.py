@@ -137,7 +137,7 @@ def _residuals(
 ) -> tuple[Tensor, Tensor, Tensor]:
     shading = c.shading * ready.apparent
     shown = relit(shown, crop, shading, c.shaded)
-    ok = (crop.known | (shown.opacity > 0.9))[:, None]
+    ok = ((crop.known | (shown.opacity > 0.9)) & ~shown.hidden)[:, None]
     zero = torch.zeros_like(shown.rgb)
     e = _blurred(torch.where(ok, shown.rgb - crop.photo, zero), crop.shape, sigma)
     # an outline is where shape, shadow and haze are wrong together: it counts, but little
