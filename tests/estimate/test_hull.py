@@ -13,7 +13,7 @@ from refield.estimate.hull import HullConfig, find_region
 from refield.estimate.lattice import Lattice, components
 from refield.estimate.look import median_depth, view_of
 from refield.field.volrend import Samples
-from refield.scene.planes import rough_planes, rough_tops, support_planes
+from refield.scene.planes import Plane, _edges, rough_planes, rough_tops, support_planes
 from tests.estimate.boxes import BoxWorld, camera_at, photograph, standing
 
 CRATE = standing((0.2, 0.17, 0.18), -0.1, -0.1, 20)
@@ -131,3 +131,12 @@ def test_a_slice_of_what_fills_space_is_no_plane():
     points = np.random.default_rng(0).uniform(0, 0.1, (4000, 3)).astype(np.float32)
     eyes = np.tile(np.array([0.05, 0.05, 3], np.float32), (4000, 1))
     assert rough_tops(points, eyes, np.ones(4000, bool), 0.004) == []
+
+
+def test_a_strip_of_points_has_edges_too():
+    """All on one line, from which no area could be told."""
+    line = np.stack([np.linspace(-1, 1, 500), np.zeros(500), np.zeros(500)], -1)
+    edges = _edges(Plane(np.array([0, 0, 1], np.float32), 0.0, 0.01), line, 0.02)
+    strip = Plane(np.array([0, 0, 1], np.float32), 0.0, 0.01, edges)
+    asked = np.array([[0, 0.01, 0.3], [0.9, 0, -0.3], [0, 0.1, 0.3], [1.2, 0, 0.3]])
+    np.testing.assert_allclose(strip.above(asked), [0.3, -0.3, np.inf, np.inf], atol=1e-6)

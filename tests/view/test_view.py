@@ -185,6 +185,7 @@ def test_a_page_is_written_whole_and_holds_everything(work, tmp_path, capsys):
     page = out.read_text(encoding="utf-8")
     assert page.startswith("<!doctype html>") and 5e5 < len(page) < 4e6
     assert "Three objects" not in page and "One object moved, one is gone, one is new" in page
+    assert page.count('<figure class="wipe"') == 1 and page.count('src="data:image/jpeg') >= 2
     assert "default-src 'none'" in page and 'src="http' not in page and 'href="http' not in page
     assert list(tmp_path.iterdir()) == [out]
     assert main(["view", str(work), "--static", str(out), "--splats", "2000", "--quiet"]) == 0  # our own is replaced

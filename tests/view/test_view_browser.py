@@ -184,6 +184,15 @@ def test_the_page_that_is_sent_needs_nothing(browser: Any, work: Path, tmp_path:
     assert len(np.unique(now.reshape(-1, 3), axis=0)) > 500
     page.locator("#visit").press("ArrowLeft")
     eventually(lambda: clock.input_value() == "10.5")
+    wiped = page.locator("aside .wipe:visible")
+    assert wiped.count() == 1
+    slider = wiped.locator("input")
+    ends = []
+    for value in ("0", "100"):  # all of it after, all of it before
+        slider.fill(value)
+        shot = wiped.locator("div").screenshot(timeout=1000 * PATIENCE)
+        ends.append(np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int))
+    assert differ(*ends) > 0.01
     page.get_by_text("One object moved, one is gone, one is new").wait_for()
     eventually(lambda: differ(picture(page), now) > 0.02)
     page.locator("#marks").uncheck()

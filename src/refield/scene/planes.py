@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
 
 Array = NDArray[Any]
@@ -17,6 +18,7 @@ _PART = 0.12  # of all points that a plane holds at least
 _FEW = 0.03  # of all points that may lie where they could not be seen, if it were one
 _PEAK = 0.4  # of as many as a plane holds may be within as much again of it: of what fills space it is half, or all
 _DEVIATION = 1.48  # times the median absolute deviation
+_CORNERS = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
 _BESIDE = 3.0  # times the distance from point to point; further apart they are of two pieces
 
 
@@ -108,7 +110,8 @@ def support_tops(points: Array, eyes: Array, still: NDArray[np.bool_], tol: floa
 
 def _ended(plane: Plane, points: Array, tol: float) -> Plane:
     """The plane as far as its points reach, and as uneven as they are around it."""
-    ended = replace(plane, edges=_edges(plane, points[np.abs(plane.height(points)) < tol]))
+    on = points[np.abs(plane.height(points)) < tol]
+    ended = replace(plane, edges=_edges(plane, on, max(_apart(on), tol)))
     off = np.abs(ended.above(points))
     return replace(ended, noise=_DEVIATION * float(np.median(off[off < 4 * tol])))
 
@@ -118,17 +121,17 @@ def _apart(points: Array) -> float:
     return _BESIDE * float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
 
 
-def _edges(plane: Plane, points: Array) -> Array:
-    """What the largest piece of a plane's points lies within, as `Plane.edges`."""
+def _edges(plane: Plane, points: Array, cell: float) -> Array:
+    """What the largest piece of a plane's points lies within, and a cell more, as `Plane.edges`."""
     axes = np.linalg.svd(plane.normal[None].astype(np.float64))[2][1:]
-    at, cell = points @ axes.T, _apart(points)
-    index = np.floor((at - at.min(0)) / cell).astype(int)
-    taken = np.zeros(index.max(0) + 1, bool)
-    taken[tuple(index.T)] = True
-    label, _ = ndimage.label(taken, np.ones((3, 3)))
-    piece = label[tuple(index.T)] == np.bincount(label[tuple(index.T)]).argmax()
-    sides = ConvexHull(at[piece]).equations
-    return np.concatenate([sides[:, :2] @ axes, cell - sides[:, 2:]], -1)
+    at = points @ axes.T
+    cells, of = np.unique(np.floor((at - at.min(0)) / cell), axis=0, return_inverse=True)
+    beside = cKDTree(cells).query_pairs(1.5, output_type="ndarray")  # at a side or a corner
+    graph = coo_matrix((np.ones(len(beside)), beside.T), (len(cells), len(cells)))
+    piece = connected_components(graph, directed=False)[1][of.ravel()]
+    largest = at[piece == np.bincount(piece).argmax()]
+    sides = ConvexHull((largest[:, None] + cell * _CORNERS).reshape(-1, 2)).equations
+    return np.concatenate([sides[:, :2] @ axes, -sides[:, 2:]], -1)
 
 
 def _planes(points: Array, eyes: Array, tol: float, possible: Callable[[Plane], bool]) -> list[Plane]:

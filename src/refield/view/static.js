@@ -37,6 +37,9 @@
   };
 
   for (const control of [visit, marks, photos, points]) control.addEventListener("input", show);
+  for (const slider of document.querySelectorAll("aside .wipe input")) {
+    slider.addEventListener("input", () => slider.parentElement.style.setProperty("--at", slider.value + "%"));
+  }
   // a browser that needs longer than this for a picture while somebody drags is given points; who wants splats yet may
   // ask for them, and keeps them
   const SLOW = 100; // milliseconds

@@ -1,4 +1,5 @@
-"""The scene as one HTML file that needs no server and no network: states to step through, boxes, photos, words.
+"""The scene as one HTML file that needs no server and no network: states to step through, boxes, photos, words, and our
+own pictures of each visit to wipe between.
 
 viser plays what a server was told back in time; each second of that is a state, with or without boxes and photos, and
 the page's own controls go to it. The page is viser's client, about 0.8 MB, with the scene inside.
@@ -20,6 +21,7 @@ from refield.view.scenery import Scenery
 from refield.view.server import opened_server, stop
 from refield.view.stage import first_look
 from refield.view.told import told
+from refield.view.wipe import wipe
 
 if TYPE_CHECKING:
     from viser import SceneApi, ViserServer
@@ -48,7 +50,9 @@ def static_page(scenery: Scenery, on_stage: OnStage = lambda name: None) -> str:
         html = _recorded(server, scenery, on_stage)
     finally:
         stop(server)
-    return _page(html, scenery)
+    on_stage("before and after")
+    wipes = [wipe(scenery, visit) for visit in range(1, scenery.latest + 1)]
+    return _page(html, scenery, wipes)
 
 
 def splats_of_a_page(states: int, most: int) -> int:
@@ -80,7 +84,6 @@ def _recorded(server: ViserServer, scenery: Scenery, on_stage: OnStage) -> str:
         scene.remove_by_name(STATE)  # a splat that is hidden takes a browser some time, too
         draw_points(scene, scenery.stage, cloud_of(splats).thinned(_POINTS))
         _play_switches(tape, groups)
-    on_stage("page")
     return tape.as_html()
 
 
@@ -102,12 +105,16 @@ def _draw_shots(scene: SceneApi, scenery: Scenery, shots: Sequence[Shot], size: 
         draw_shot(scene, scenery.stage, filled, size, under=under)
 
 
-def _page(html: str, scenery: Scenery) -> str:
-    """viser's page with controls of ours beside its picture, and nothing that could reach the network."""
+def _page(html: str, scenery: Scenery, wipes: Sequence[str]) -> str:
+    """viser's page with controls of ours beside its picture, and nothing that could reach the network.
+
+    ``wipes``: for each visit, see `wipe`.
+    """
     name = escape(scenery.workspace.path.resolve().name)
     changes = [None, *scenery.changes]
     texts = [told(n, change, scenery.world) for n, change in enumerate(changes)]
-    words = "".join(f'<section class="visit" hidden>{text}</section>' for text in texts)
+    shown = zip(texts, ["", *wipes])
+    words = "".join(f'<section class="visit" hidden>{text}{pair}</section>' for text, pair in shown)
     # viser's own script unpacks itself, and sorts splats in a worker that it makes of text
     policy = (
         "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; font-src data:; connect-src data: blob:; "
