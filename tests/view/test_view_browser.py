@@ -77,6 +77,11 @@ def differ(a: np.ndarray, b: np.ndarray) -> float:
     return float((np.abs(a - b).max(-1) > 12).mean())
 
 
+def nearer(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> bool:
+    """Whether a picture is much more like one than like another; the browser draws lines a little off now and then."""
+    return differ(a, b) < 0.5 * differ(a, c)
+
+
 def enter(box: Any, number: int) -> None:
     """Type a number beside its slider."""
     box.fill(str(number))
@@ -112,14 +117,16 @@ def test_it_is_looked_at_wiped_and_moved(browser: Any, work: Path, tmp_path: Pat
         visit, wipe = (page.locator(".mantine-NumberInput-input").nth(i) for i in (0, 1))
         enter(wipe, 100)
         eventually(lambda: session.panel.wipe == 1 and session.finest and differ(picture(page), now) > 0.03)
+        wiped = settled(page)
         enter(wipe, 0)
-        eventually(lambda: session.panel.wipe == 0 and session.finest and differ(picture(page), now) < 0.02)
+        eventually(lambda: session.panel.wipe == 0 and session.finest and nearer(picture(page), now, wiped))
         enter(visit, 1)
         page.get_by_text("One object moved, one is gone, one is new").wait_for()
         eventually(lambda: session.finest and differ(picture(page), now) > 0.03)
+        earlier = settled(page)
         enter(visit, 2)
         page.get_by_text("One object moved, by hand").wait_for()
-        eventually(lambda: session.finest and differ(picture(page), now) < 0.02)
+        eventually(lambda: session.finest and nearer(picture(page), now, earlier))
 
         # a click picks the box, an arrow drags it, and the move is kept
         page.get_by_text("Move a thing by hand").click()
@@ -182,8 +189,6 @@ def test_the_page_that_is_sent_needs_nothing(browser: Any, work: Path, tmp_path:
     page.get_by_text("One object moved, by hand").wait_for()
     now = settled(page)
     assert len(np.unique(now.reshape(-1, 3), axis=0)) > 500
-    page.locator("#visit").press("ArrowLeft")
-    eventually(lambda: clock.input_value() == "10.5")
     wiped = page.locator("aside .wipe:visible")
     assert wiped.count() == 1
     slider = wiped.locator("input")
@@ -193,6 +198,8 @@ def test_the_page_that_is_sent_needs_nothing(browser: Any, work: Path, tmp_path:
         shot = wiped.locator("div").screenshot(timeout=1000 * PATIENCE)
         ends.append(np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int))
     assert differ(*ends) > 0.01
+    page.locator("#visit").press("ArrowLeft")
+    eventually(lambda: clock.input_value() == "10.5")
     page.get_by_text("One object moved, one is gone, one is new").wait_for()
     eventually(lambda: differ(picture(page), now) > 0.02)
     page.locator("#marks").uncheck()
