@@ -123,11 +123,9 @@ def noise_at(view: View, survey: Sequence[Changed]) -> Array:
     points = np.where(finite[:, None], points, 0)
     total, count = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
     for old in survey:
-        uv, distance, inside = old.view.project(points)
-        front = old.view.lookup(old.view.depth, uv, inside)
-        error = old.view.lookup(old.difference, uv, inside)
-        visible = inside & finite & (np.abs(front - distance) < 0.03 * distance)
-        total += np.where(visible, error, 0)
+        uv, shown = old.view.shows(points, 0.03)
+        visible = shown & finite
+        total += np.where(visible, old.view.lookup(old.difference, uv, shown), 0)
         count += visible
     mean = np.where(count > 0, total / np.maximum(count, 1), 0)
     return mean.reshape(view.shape)

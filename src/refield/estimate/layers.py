@@ -154,11 +154,16 @@ class Layers:
         seen = self._plain.with_rows(near, see(self.sight.field, self._rays[near], hidden))
         return seen.rgb, seen.depth
 
+    @cached_property
+    def _placed(self) -> Tensor:
+        """(N,) depth of the objects that were placed already."""
+        return torch.cat([c.placed for c in self.crops])
+
     def show(self, new_from_old: Tensor) -> list[Layer]:
         """The moved object over the fixed background, per crop (Eqs. 1, 3)."""
         alone = object_alone(self.sight.field, self.old, self._rays, new_from_old, self._sampler)
         behind, beyond = self._behind
-        hidden = torch.cat([c.placed for c in self.crops]) < alone.depth
+        hidden = self._placed < alone.depth
         front = self._in_front(alone, beyond) & ~hidden
         opacity = torch.where(front, alone.opacity, torch.zeros_like(alone.opacity))
         own = torch.where(front[:, None], alone.rgb, torch.zeros_like(alone.rgb))

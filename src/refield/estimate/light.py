@@ -126,11 +126,10 @@ def _agreement(i: int, changed: Sequence[Changed], ratios: Sequence[Ratio]) -> t
     for k, other in enumerate(changed):
         if k == i:
             continue
-        uv, distance, inside = other.view.project(points)
-        front = other.view.lookup(other.view.depth, uv, inside)
-        visible = ok & inside & (np.abs(front - distance) < SAME_PLACE * distance)
-        same = np.abs(other.view.lookup(ratios[k].each, uv, inside) - own).max(-1) < _AGREE
-        touched = other.view.lookup(pixels.dilate(other.mask, 1), uv, inside)
+        uv, shown = other.view.shows(points, SAME_PLACE)
+        visible = ok & shown
+        same = np.abs(other.view.lookup(ratios[k].each, uv, shown) - own).max(-1) < _AGREE
+        touched = other.view.lookup(pixels.dilate(other.mask, 1), uv, shown)
         asked += visible
         agrees += visible & same
         denies += visible & ~touched

@@ -230,6 +230,12 @@ class View:
         inside = (z > 1e-6) & (uv >= 0).all(-1) & (uv[..., 0] < w) & (uv[..., 1] < h)
         return uv.numpy(), local.norm(dim=-1).numpy(), inside.numpy()
 
+    def shows(self, points: Array, within: float) -> tuple[Array, Array]:
+        """World (..., 3) -> pixels (..., 2), and whether the old surface there is the points', (...,): no further from
+        them than this part of their distance."""
+        uv, distance, inside = self.project(points)
+        return uv, inside & (np.abs(self.lookup(self.depth, uv, inside) - distance) < within * distance)
+
     def lookup(self, image: Array, uv: Array, inside: Array) -> Array:
         """Nearest pixel's value at ``uv`` (..., 2); that of pixel (0, 0) outside the image."""
         j = np.where(inside, uv[..., 0], 0).astype(np.int64)

@@ -228,11 +228,9 @@ def _still(points: Array, changed: Sequence[Changed]) -> Mask:
     """Which world points (N, 3) on old surfaces a new photo shows as they were, and none otherwise."""
     shown, touched = np.zeros(len(points), bool), np.zeros(len(points), bool)
     for c in changed:
-        uv, distance, inside = c.view.project(points)
-        front = c.view.lookup(c.view.depth, uv, inside)
-        seen = inside & (np.abs(front - distance) < SAME_PLACE * distance)
+        uv, seen = c.view.shows(points, SAME_PLACE)
         shown |= seen
-        touched |= seen & c.view.lookup(c.mask, uv, inside)
+        touched |= seen & c.view.lookup(c.mask, uv, seen)
     return shown & ~touched
 
 

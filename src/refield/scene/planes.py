@@ -48,16 +48,7 @@ class Plane:
 
 def rough_planes(points: Array, cameras: Array, resolved: float) -> list[Plane]:
     """`support_planes` of points that are exact to ``resolved`` (world units), or up to four times less exact."""
-    for tol in _roughly(resolved):
-        planes = support_planes(points, cameras, tol)
-        if planes:
-            return planes
-    return []
-
-
-def _roughly(resolved: float) -> list[float]:
-    """How far from a plane its points may be; a fitted surface may be uneven."""
-    return [rough * 0.7 * resolved for rough in (1, 2, 4)]
+    return _roughly(lambda tol: support_planes(points, cameras, tol), resolved)
 
 
 def support_planes(points: Array, cameras: Array, tol: float) -> list[Plane]:
@@ -71,11 +62,12 @@ def support_planes(points: Array, cameras: Array, tol: float) -> list[Plane]:
 
 def rough_tops(points: Array, eyes: Array, still: NDArray[np.bool_], resolved: float) -> list[Plane]:
     """`support_tops` of points that are exact to ``resolved`` (world units), or up to four times less exact."""
-    for tol in _roughly(resolved):
-        planes = support_tops(points, eyes, still, tol)
-        if planes:
-            return planes
-    return []
+    return _roughly(lambda tol: support_tops(points, eyes, still, tol), resolved)
+
+
+def _roughly(planes_at: Callable[[float], list[Plane]], resolved: float) -> list[Plane]:
+    """The planes of the least tolerance at which there are any; a fitted surface may be uneven."""
+    return next(filter(None, (planes_at(rough * 0.7 * resolved) for rough in (1, 2, 4))), [])
 
 
 def support_tops(points: Array, eyes: Array, still: NDArray[np.bool_], tol: float) -> list[Plane]:
@@ -91,15 +83,14 @@ def support_tops(points: Array, eyes: Array, still: NDArray[np.bool_], tol: floa
     """
 
     def possible(plane: Plane) -> bool:
-        off = np.abs(plane.height(points))
-        on = off < tol
-        if (off < 2 * tol).sum() > (1 + _PEAK) * on.sum():
+        height, before = plane.height(points), plane.height(eyes)
+        on = np.abs(height) < tol
+        if (np.abs(height) < 2 * tol).sum() > (1 + _PEAK) * on.sum():
             return False
-        before, behind = plane.height(eyes), plane.height(points) < -2.5 * tol
         if (before[on] <= 0).mean() > _FEW:
             return False
-        through = np.flatnonzero(behind & (before > 0) | (before < 0) & (plane.height(points) > 2.5 * tol))
-        part = (before[through] / (before[through] - plane.height(points[through])))[:, None]
+        through = np.flatnonzero((height < -2.5 * tol) & (before > 0) | (before < 0) & (height > 2.5 * tol))
+        part = (before[through] / (before[through] - height[through]))[:, None]
         met = eyes[through] + part * (points[through] - eyes[through])
         beside = cKDTree(points[on]).query(met, distance_upper_bound=_apart(points[on]))[0]
         return bool(np.isfinite(beside).sum() < _FEW * len(points))

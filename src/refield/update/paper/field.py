@@ -45,7 +45,7 @@ class PaperField:
         self.pretrained, self.change, self.helper, self.proposals = pretrained, change, helper, proposals
         self.region = region
         self.moves: tuple[Move, ...] = moves_of(change)
-        self.base: NerfactoField = pretrained.base if isinstance(pretrained, PaperField) else pretrained
+        self.base = base_of(pretrained)
         self.boxes: tuple[Tensor, ...] = tuple(m.box_now for m in self.moves) + region.boxes
         self.why_stopped = ""
         """what ended its training, in words; empty if it was not trained here"""
@@ -117,12 +117,17 @@ class PaperField:
         return self.pretrained.proposed_at(x) if isinstance(self.pretrained, PaperField) else x
 
 
+def base_of(field: NerfactoField | PaperField) -> NerfactoField:
+    """The field before any update."""
+    return field.base if isinstance(field, PaperField) else field
+
+
 def begun(
     pretrained: NerfactoField | PaperField, change: SceneChange, looks: tuple[int, int], dilation: float, seed: int
 ) -> PaperField:
     """The field before training: a helper from scratch with P photos' looks of E numbers, and the proposal networks as
     they were, ready to be trained. Those who march through it see the old field yet."""
-    base = pretrained.base if isinstance(pretrained, PaperField) else pretrained
+    base = base_of(pretrained)
     helper = HelperField(base.config, base.contraction, looks, seed)
     proposals = deepcopy(pretrained.proposals)
     for p in proposals.parameters():

@@ -13,7 +13,7 @@ from refield.field.nerfacto import NerfactoField
 from refield.field.radiance import Field
 from refield.field.stored import State, occupancy_in, sampler_out
 from refield.scene.change import SceneChange
-from refield.update.paper.field import PaperField
+from refield.update.paper.field import PaperField, base_of
 from refield.update.paper.helper import HelperField
 from refield.update.region import region_in, region_out
 
@@ -37,7 +37,7 @@ def paper_from_state(
     """
     if not isinstance(pretrained, NerfactoField | PaperField):
         raise ValueError(f"the field before is a {type(pretrained).__name__}, not one of NeRFacto's shape")
-    base = pretrained.base if isinstance(pretrained, PaperField) else pretrained
+    base = base_of(pretrained)
     helper = HelperField.from_state(_below("helper.", tensors), facts["helper"], base.contraction)
     proposals = deepcopy(base.proposals)
     proposals.load_state_dict(_below("proposals.", tensors))
