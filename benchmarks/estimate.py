@@ -74,8 +74,9 @@ class Scene:
 class Bench:
     """Makes scenes once, and keeps what was found."""
 
-    def __init__(self, work: Path, out: Path, size: int, cameras: int, seeds: int) -> None:
-        self.work, self.out, self.size, self.cameras, self.seeds = work, out, size, cameras, seeds
+    def __init__(self, work: Path, out: Path, size: int, cameras: int, seeds: int, spp: int = 64) -> None:
+        """``spp``: light paths a pixel of the worlds that are made."""
+        self.work, self.out, self.size, self.cameras, self.seeds, self.spp = work, out, size, cameras, seeds, spp
         self.worlds: Sequence[str] = (*PAPER, *HARD)
         """of the section ``kinds``"""
 
@@ -84,7 +85,7 @@ class Bench:
         size = size or self.size
         folder = self.work / f"{name}_{seed}_{size}"
         if not (folder / "data" / "truth").exists():
-            write_world(name, folder / "data", size=size, cameras=self.cameras, seed=seed)
+            write_world(name, folder / "data", size=size, spp=self.spp, cameras=self.cameras, seed=seed)
         if not (folder / "work").exists():
             capture = load_capture(folder / "data" / "before")
             with Workspace.building(folder / "work") as workspace:

@@ -101,6 +101,7 @@ class Eyes:
     views: list
     unsure: set = field(default_factory=set)
     """indices of views in which the segmenter hesitates"""
+    sure: float = 0.95
 
     def __post_init__(self):
         self.signatures = np.stack([signature(v.image) for v in self.views])
@@ -252,9 +253,11 @@ def test_a_view_in_which_old_and_new_place_overlap_gives_both_masks(stage, moved
         assert np.array_equal(came, silhouette(moved.after, "cube", CAMERA, pose))
         gone = [silhouette(stage.before, n, CAMERA, pose).numpy() for n in ("cube", "drum")]
         assert {m.tobytes() for m in v.move_out} == {m.tobytes() for m in gone}
-    # alone, the merged contour would have lost one of the two
+    # alone, the merged contour still holds two masks; were it not asked for that, it would lose one of them
     (alone,) = detect(moved.views[-1:], survey, moved.eyes, DetectConfig())
-    assert not alone.overlap and len(alone.move_in) + len(alone.move_out) == 2
+    assert alone.overlap and len(alone.move_in) + len(alone.move_out) == 3
+    (one,) = detect(moved.views[-1:], survey, moved.eyes, DetectConfig(own=1.01))
+    assert not one.overlap and len(one.move_in) + len(one.move_out) == 2
 
 
 def test_one_new_photo_is_told_to_be_too_few(stage, moved):
@@ -296,8 +299,8 @@ def test_no_photo_and_another_scene_are_refused(stage, moved):
 
 
 def test_without_weights_the_route_ends_in_a_valid_change(stage, moved):
-    """GrabCut and SIFT: its confidences are not SAM's, so fewer are asked for."""
-    config = PaperConfig(survey=3, segment=SegmentConfig(confidence=0.5), refine=CONFIG.refine)
+    """GrabCut and SIFT."""
+    config = PaperConfig(survey=3, refine=CONFIG.refine)
     change = estimate_change_paper(stage.capture, stage.field, moved.frames[: len(NEW)], Models(), config)
     assert change.why and [p.status for p in change.photos] == ["used"] * len(NEW)
     assert len(change.masks_in) == len(change.masks_out) == (len(NEW) if change.objects else 0)
@@ -432,7 +435,7 @@ def test_what_old_photos_show_too_is_no_change():
 
 
 def areas(*values):
-    return tuple(Contour(np.zeros(4), float(v)) for v in values)
+    return tuple(Contour(np.zeros(4), float(v), np.zeros((1, 1), bool)) for v in values)
 
 
 @pytest.mark.parametrize(
@@ -516,7 +519,7 @@ def test_masks_below_the_papers_confidence_are_left_out(stage, confidence, kept)
 
     corners = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (0, 0.2)], np.float32)
     frame = stage.capture.frames[0]
-    (asked,) = old_masks([frame], corners, SimpleNamespace(masks=masks), SIZE**2, SegmentConfig())
+    (asked,) = old_masks([frame], corners, SimpleNamespace(masks=masks, sure=0.95), SIZE**2, SegmentConfig())
     assert (asked.mask is not None) == kept == (asked.full() is not None)
     uv = CAMERA.project(transform(invert(frame.world_from_cam), torch.from_numpy(corners)))[0].numpy()
     np.testing.assert_allclose(box[0][2:] - box[0][:2], 1.05 * (uv.max(0) - uv.min(0)), rtol=1e-3)

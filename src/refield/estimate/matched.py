@@ -106,14 +106,16 @@ def matched_poses(
     return out
 
 
-def camera_from_object(uv: NDArray[np.float64], xyz: NDArray[np.float64], camera: Camera, least: int) -> Tensor | None:
-    """cam_from_old (4, 4) of one photo (Eq. 8), or None."""
+def camera_from_object(
+    uv: NDArray[np.float64], xyz: NDArray[np.float64], camera: Camera, least: int, most_error: float = 2.0
+) -> Tensor | None:
+    """cam_from_old (4, 4) of one photo (Eq. 8), or None. ``most_error``: pixels within which a point agrees."""
     if len(uv) < least:
         return None
     lens = [camera.fx, camera.fy, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
     model = pycolmap.Camera(model="OPENCV", width=camera.width, height=camera.height, params=lens)
     options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error = 2.0
+    options.ransac.max_error = most_error
     options.ransac.random_seed = 0
     answer = pycolmap.estimate_and_refine_absolute_pose(uv, xyz, model, estimation_options=options)
     if not answer or answer["num_inliers"] < least:

@@ -71,6 +71,8 @@ class SamSegmenter:
     """boxes decoded at a time"""
     remembered: int = 16
     """images whose embeddings are kept, at 4 to 21 MB each; at least 1. Four views, photographed and rendered, twice"""
+    sure: float = 0.95
+    """see `Segmenter`"""  # §10.1.3
     _embeddings: OrderedDict[bytes, dict[str, Any]] = field(default_factory=OrderedDict, init=False, repr=False)
 
     def __post_init__(self) -> None:

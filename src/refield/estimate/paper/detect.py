@@ -44,6 +44,8 @@ class DetectConfig:
     """a change differs by more than this many times the level at which no old photo would show one"""
     merged: float = 1.5
     """a contour this many times as large as the view's others may be two that overlap"""  # Fig. 13
+    own: float = 0.1
+    """part of a contour that each picture's mask must hold for itself, if the two are of different places"""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,8 @@ class Contour:
     """+5 %"""
     area: float
     """pixels"""
+    inside: Mask
+    """(H, W) bool: it and what it encloses"""
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,7 @@ def detect(
     pairs = [paired(v, segmenter, config) for v in views]
     found = [contours(p.unlike, level, config) for p in pairs]
     merged = overlapping(found, config.merged)
-    return tuple(_told_apart(p, c, m, segmenter) for p, c, m in zip(pairs, found, merged))
+    return tuple(_told_apart(p, c, m, segmenter, config.own) for p, c, m in zip(pairs, found, merged))
 
 
 def paired(view: View, segmenter: Segmenter, config: DetectConfig) -> Pair:
@@ -146,11 +150,15 @@ def contours(unlike: Array, level: float, config: DetectConfig) -> tuple[Contour
         return ()
     mask = unlike > max(level, pixels.otsu(unlike, top))
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    found = [(cv2.boundingRect(c), float(cv2.contourArea(c))) for c in outlines]
-    large = [(rect, area) for rect, area in found if area >= config.smallest * mask.size]
-    large.sort(key=lambda f: -f[1])
-    shape = (mask.shape[0], mask.shape[1])
-    return tuple(Contour(enlarged((x, y, x + w, y + h), shape, config.box), a) for (x, y, w, h), a in large)
+    large = [c for c in outlines if cv2.contourArea(c) >= config.smallest * mask.size]
+    large.sort(key=lambda c: -cv2.contourArea(c))
+    return tuple(_contour(np.asarray(c), (mask.shape[0], mask.shape[1]), config.box) for c in large)
+
+
+def _contour(outline: NDArray[np.int32], shape: tuple[int, int], factor: float) -> Contour:
+    x, y, w, h = cv2.boundingRect(outline)
+    inside = np.asarray(cv2.drawContours(np.zeros(shape, np.uint8), [outline], -1, 1, cv2.FILLED), np.uint8) > 0
+    return Contour(enlarged((x, y, x + w, y + h), shape, factor), float(cv2.contourArea(outline)), inside)
 
 
 def enlarged(box: Sequence[float] | Box, shape: tuple[int, int], factor: float) -> Box:
@@ -180,14 +188,26 @@ def overlapping(found: Sequence[Sequence[Contour]], factor: float) -> list[froze
     return out
 
 
-def _told_apart(pair: Pair, found: Sequence[Contour], merged: frozenset[int], segmenter: Segmenter) -> ViewMasks:
+def holds_two(inside: Mask, came: Mask, left: Mask, own: float) -> bool:
+    """Whether a contour's pixels (H, W) are those of two masks, each with a part of them for itself.
+
+    The number of contours says nothing where the places overlap in every view, as those of a thing do that moved by
+    less than it is wide. But then the photo's object covers one part of the contour, and the rendering's another.
+    """
+    least = own * inside.sum()
+    return bool((inside & came & ~left).sum() >= least and (inside & left & ~came).sum() >= least)
+
+
+def _told_apart(
+    pair: Pair, found: Sequence[Contour], merged: frozenset[int], segmenter: Segmenter, own: float
+) -> ViewMasks:
     """Ask the segmenter on both pictures: the surer one wins, but for merged contours, which keep both masks."""
     if not found:
         return ViewMasks(pair)
     boxes = np.stack([c.box for c in found])
     ins, sure_in = segmenter.masks(pair.capture, boxes)
     outs, sure_out = segmenter.masks(pair.render, boxes)
-    both = np.array([i in merged for i in range(len(found))])
+    both = np.array([i in merged or holds_two(c.inside, ins[i], outs[i], own) for i, c in enumerate(found)])
     came = (both | (sure_in > sure_out)) & ins.any((1, 2))
     left = (both | (sure_in <= sure_out)) & outs.any((1, 2))
     scores_in, scores_out = tuple(map(float, sure_in[came])), tuple(map(float, sure_out[left]))

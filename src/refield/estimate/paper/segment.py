@@ -35,8 +35,8 @@ class SegmentConfig:
     """of the cloud's points, those nearest to its centroid, are believed"""
     box: float = 1.05
     """size of the box that is asked about, against the projected cloud's"""
-    confidence: float = 0.95
-    """of the segmenter (SAM's scale); an old photo with less is left out"""  # §10.1.3
+    confidence: float | None = None
+    """of the segmenter; an old photo with less is left out. None: from which on it is sure, SAM's 0.95"""  # §10.1.3
     expanded: float = 3.0
     """size of the grid's box, against the cloud's"""
     nodes: int = 100
@@ -86,7 +86,8 @@ def _old_mask(frame: Frame, camera: Camera, cloud: Array, segmenter: Segmenter, 
     if box is None:  # that it is not in the picture is known
         return OldMask(frame, camera, np.zeros((camera.height, camera.width), bool))
     masks, scores = segmenter.masks(pixels.to_bytes(scaled_image(frame, camera).numpy()), box[None])
-    sure = bool(scores[0] >= config.confidence and masks[0].any())
+    least = segmenter.sure if config.confidence is None else config.confidence
+    sure = bool(scores[0] >= least and masks[0].any())
     return OldMask(frame, camera, masks[0] if sure else None)
 
 

@@ -138,7 +138,7 @@ def _why_moved(moved: ObjectChange, matched: MatchedPose) -> str:
     assert moved.new_from_old is not None and moved.shift is not None
     turn = float(angle_between(moved.new_from_old, torch.eye(4, dtype=torch.float64)))
     shift = float(moved.shift.norm())
-    agree = f"{matched.inliers} matched features ({100 * matched.share:.0f} %) agree"
+    agree = f"{matched.inliers} matched features agree ({100 * matched.share:.0f} % of the best pair's)"
     return f"1 moved by {shift:.4g} and turned by {turn:.0f} degrees: {agree}"
 
 
