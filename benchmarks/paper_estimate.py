@@ -31,9 +31,9 @@ from refield.estimate.look import view_of
 from refield.estimate.paper.associate import Sighting, Thing
 from refield.estimate.paper.config import PaperConfig
 from refield.estimate.paper.detect import paired
-from refield.estimate.paper.pose import matched_pixels, matched_pose
-from refield.estimate.paper.refine import interest, refine
+from refield.estimate.paper.pose import matched_pose
 from refield.estimate.paper.route import estimate_change_paper
+from refield.estimate.paper.settle import refined_pose
 from refield.evaluate import pose_error
 from refield.scene.errors import InputError
 from refield.synthetic.worlds import WORLDS
@@ -59,9 +59,7 @@ def poses(scene: Scene) -> Row:
     if found is None:
         return row | {"found": "no"}
     matched = time.perf_counter()
-    pixels, masks = matched_pixels(found.matches), {s.pair.view.frame.name: s.mask for s in came.sightings}
-    targets = interest(pixels, [masks[v.frame.name] for v, _ in pixels], CONFIG.refine)
-    better = refine(scene.field, targets, found.new_from_old, CONFIG.refine)
+    better = refined_pose(scene.field, found, came, CONFIG)
     return row | {
         "all pairs: cm, degrees": _errors(scene, found.new_from_old),
         "inliers": f"{found.inliers} of {sum(len(m.uv) for m in found.matches)}",

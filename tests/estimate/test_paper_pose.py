@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from refield.estimate.paper import settle
+from refield.estimate.paper.config import PaperConfig
 from refield.estimate.paper.detect import holds_two
-from refield.estimate.paper.pose import Matches, PoseConfig, matched_pose, softened, world_from_object
+from refield.estimate.paper.pose import MatchedPose, Matches, PoseConfig, matched_pose, softened, world_from_object
+from refield.estimate.paper.refine import Refined
 from refield.scene.capture import Frame
 from refield.scene.pose import angle_between, exp, invert, transform
 from refield.synthetic.cameras import looking_at, square_camera
@@ -69,6 +72,21 @@ def test_what_agrees_on_nothing_has_no_pose():
         ]
         agree = int((np.linalg.norm(np.concatenate(seen) - uv, axis=1) < PoseConfig.error).sum())
     assert agree < PoseConfig.least
+
+
+def test_refinement_that_leads_away_from_the_features_is_not_taken(monkeypatch):
+    rng = np.random.default_rng(1)
+    pairs = tuple(features(photo(a), axis, rng, wrong=0) for a, axis in ((20, 0), (110, 1), (200, 2)))
+    start = world_from_object(pairs, PoseConfig())
+    found = MatchedPose(start, 18, 1.0, pairs)
+    nowhere = torch.eye(4, dtype=torch.float64)
+    nowhere[0, 3] = 5
+    for end, taken in ((MOVED, MOVED), (nowhere, start)):
+        monkeypatch.setattr(settle, "matched_pixels", lambda matches: [])
+        monkeypatch.setattr(settle, "refine", lambda field, targets, begin, config, end=end: Refined(end, 0.1, 0.3, 7))
+        better = settle.refined_pose(None, found, SimpleNamespace(sightings=()), PaperConfig())
+        assert torch.equal(better.new_from_old, taken)
+        assert better.loss == (0.1 if taken is MOVED else 0.3)
 
 
 def test_a_photo_is_softened_by_a_share_of_its_width():

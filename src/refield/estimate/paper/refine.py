@@ -38,6 +38,9 @@ class RefineConfig:
     """of all photos together, drawn evenly from the interest regions"""
     dilations: int = 10
     """of matched pixels, with a 3 x 3 kernel: the interest regions"""
+    keeps: float = 0.5
+    """part of the features that agreed at the start and must at the end. Where a side of the object stands in another
+    light than before, other places can look more like it than its own"""
     seed: int = 0
     """of the rays drawn"""
 

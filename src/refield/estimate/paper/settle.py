@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -14,7 +14,7 @@ from refield.estimate.paper import segment
 from refield.estimate.paper.associate import Partners, Sighting, Thing
 from refield.estimate.paper.config import PaperConfig
 from refield.estimate.paper.newcomer import newcomer_grid
-from refield.estimate.paper.pose import MatchedPose, landing, matched_pixels, matched_pose
+from refield.estimate.paper.pose import MatchedPose, agreeing, landing, matched_pixels, matched_pose
 from refield.estimate.paper.refine import Refined, interest, refine
 from refield.estimate.paper.segment import OldMask
 from refield.estimate.segment import masks_in
@@ -69,10 +69,22 @@ def settle(scene: Scene, partners: Partners) -> list[Settled]:
     if found is None or landing(cloud, came, found.new_from_old) < c.pose.lands:
         note = "what left and what arrived look alike, but their features agree on no pose"
         return [Settled(gone, None, cloud, note=note), Settled(None, came, cloud[:0], note=note)]
+    return [Settled(gone, came, cloud, found, refined_pose(scene.field, found, came, c))]
+
+
+def refined_pose(field: Field, found: MatchedPose, came: Thing, config: PaperConfig) -> Refined:
+    """A pose from features, refined (§9.3) unless that leads away from the features."""
     features = matched_pixels(found.matches)
     masks = {s.pair.view.frame.name: s.mask for s in came.sightings}
-    targets = interest(features, [masks[v.frame.name] for v, _ in features], c.refine)
-    return [Settled(gone, came, cloud, found, refine(scene.field, targets, found.new_from_old, c.refine))]
+    targets = interest(features, [masks[v.frame.name] for v, _ in features], config.refine)
+    better = refine(field, targets, found.new_from_old, config.refine)
+    before, after = (
+        sum(agreeing(m, pose, config.pose.error) for m in found.matches)
+        for pose in (found.new_from_old, better.new_from_old)
+    )
+    if after < config.refine.keeps * before:
+        return replace(better, new_from_old=found.new_from_old, loss=better.before)
+    return better
 
 
 def outcome(scene: Scene, s: Settled) -> Outcome:
