@@ -69,7 +69,7 @@ def test_the_short_help_shows_first_sentences_and_defaults(monkeypatch):
     assert lines[at + 1].strip() == "stop after so long"
     assert "  --poses.photos.longest INT" in lines and "(default: 1600)" in help_of("train")
     assert "  --no-placed         the new photos" in help_of("rehearse") and "0 is" in help_of("render")
-    assert "of the world random (default: 0)" in " ".join(help_of("synth").split())
+    assert "in the world random (default: 0)" in " ".join(help_of("synth").split())
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -36,6 +36,7 @@ _THROUGH = 0.25  # of as many views as show a point may look through it
 _PARALLAX = 0.2  # of that of the nearer surfaces; where it is less their distance is not known
 _NEARER = 0.75  # of the pixels may show a sky
 _BACK, _STRAY = 4.0, 3.0  # footprints: from how far a point is asked for again, and how far it may have been off
+_STEPS = 32  # of that way, and of as much behind the point
 _CLOSE = 0.06  # of a colour's range: a colour from close by may differ by as much from the views' mean
 _NEIGHBOURS = 12  # tell a normal
 _MAD = 1.4826
@@ -201,13 +202,33 @@ def _asked_again(field: Field, views: Sequence[View], points: Points, tolerance:
     way = _squarest(views, points, tolerance)
     back = _BACK * points.footprint
     shown = render_many(field, Rays(points.xyz + way * back[:, None], -way))
-    shift = shown.depth.cpu() - back
-    met = (shown.opacity.cpu() > _OPAQUE) & (shift.abs() < _STRAY * points.footprint)
+    shift, opacity = _depth_near(field, points, way)
+    met = (opacity > _OPAQUE) & (shift.abs() < _STRAY * points.footprint)
     moved = replace(points, xyz=points.xyz - way * shift[:, None], rgb=shown.rgb.cpu(), facing=way)[met]
     seen = _seen_by(views, moved.xyz, tolerance)
     # a ray that begins behind thin haze may show what no photo does
     rgb = seen.rgb + (moved.rgb - seen.rgb).clamp(-_CLOSE, _CLOSE)
     return _with_normals(replace(moved, rgb=rgb.clamp(0, 1))[seen.agreed])
+
+
+def _depth_near(field: Field, points: Points, way: Tensor) -> tuple[Tensor, Tensor]:
+    """How far behind the points, against ``way`` (P, 3), the light ends on the mean (P,), and how much of it (P,).
+
+    By finer steps than a picture is rendered with: in these, what grows dense gradually is met too far in.
+    """
+    t = torch.linspace(-_BACK, _BACK, _STEPS + 1)
+    middle, depths, opacities = (t[1:] + t[:-1]) / 2, [], []
+    for rows in torch.arange(len(points)).split(_PIECE // _STEPS):
+        footprint = points.footprint[rows, None]
+        x = points.xyz[rows, None] - way[rows, None] * (footprint * middle)[..., None]
+        with torch.no_grad():
+            sigmas = field.density(x.reshape(-1, 3)).reshape(x.shape[:2]).cpu()
+        optical = (sigmas * footprint * (t[1] - t[0])).cumsum(1)
+        weight = torch.diff(-torch.exp(-optical), dim=1, prepend=torch.full_like(footprint, -1.0))
+        opacity = weight.sum(1)
+        depths.append((weight * footprint * middle).sum(1) / opacity.clamp_min(torch.finfo(torch.float32).tiny))
+        opacities.append(opacity)
+    return torch.cat(depths), torch.cat(opacities)
 
 
 def _squarest(views: Sequence[View], points: Points, tolerance: float) -> Tensor:
