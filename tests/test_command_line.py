@@ -17,6 +17,7 @@ import tyro
 from refield.cli import COMMANDS, main
 from refield.commands import update
 from refield.commands.answer import Exit
+from refield.commands.brief import options_of
 from refield.commands.clock import Clock
 from refield.commands.completion import script
 from refield.commands.options import Output, kind_of, names, parsed, shown
@@ -27,7 +28,7 @@ from tests.conftest import HERE, TINY_FIT
 from tests.test_cli import FEW, believing, place  # noqa: F401
 
 OPTION = re.compile(r"--[a-z][\w.-]*")
-LONGEST = 80  # lines of a short help, on a terminal of 80 columns
+LONGEST = 40  # lines of a short help, on a terminal of 80 columns
 
 
 def help_of(command, option="--help"):
@@ -39,7 +40,7 @@ def help_of(command, option="--help"):
 
 
 def options_in(text):
-    """Of the boxes, on whose lines options begin."""
+    """Of the lines, in a box or without, that begin with some."""
     lines = [line.strip("│| ") for line in text.splitlines() if re.match("[│| ] -", line)]
     return {name for line in lines for name in OPTION.findall(line.split("  ")[0])} - {"--help", "--help-all"}
 
@@ -48,10 +49,27 @@ def options_in(text):
 def test_help_is_short_and_says_how_to_begin(command, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")  # wide enough for no second column
     brief, whole = help_of(command), help_of(command, "--help-all")
-    assert len(brief.splitlines()) <= LONGEST and len(options_in(brief)) <= 25
+    assert len(brief.splitlines()) <= LONGEST and max(map(len, brief.splitlines())) <= 80
+    assert len(options_in(brief)) <= 25
     assert f"examples:\n  refield {command}" in brief
     assert not re.search(r"§|\bEq\. |\bFig\. ", brief + whole)
     assert {"--json", "--quiet", "--verbose"} <= options_in(brief) <= options_in(whole)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_what_the_short_help_shows_is_told_in_four_lines(command):
+    for option in (option for option in options_of(kind_of(command)) if option.usual):
+        assert option.told and len(option.in_short()) < 4 * 58, option.name
+
+
+def test_the_short_help_shows_first_sentences_and_defaults(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = help_of("train").splitlines()
+    at = lines.index("  --fit.max-seconds NUMBER")
+    assert lines[at + 1].strip() == "stop after so long"
+    assert "  --poses.photos.longest INT" in lines and "(default: 1600)" in help_of("train")
+    assert "  --no-placed         the new photos" in help_of("rehearse") and "0 is" in help_of("render")
+    assert "in the world random (default: 0)" in " ".join(help_of("synth").split())
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -77,7 +95,7 @@ def test_what_the_short_help_hides_is_accepted_as_before():
 def test_every_command_takes_what_all_take():
     for command in COMMANDS:
         assert kind_of(command).__dataclass_fields__["output"].default == Output()
-        assert issubclass(shown(kind_of(command), whole=False), kind_of(command))
+        assert issubclass(shown(kind_of(command)), kind_of(command))
 
 
 def told(capsys, *argv, code=0):

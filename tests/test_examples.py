@@ -10,6 +10,7 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
+from urllib.request import urlopen
 
 import pytest
 import torch
@@ -26,6 +27,7 @@ from refield.field import fit
 from refield.scene.images import read_image
 from refield.update.config import UpdateConfig
 from refield.update.train import update_field
+from refield.view.server import Viewer
 from refield.visits import opened
 from refield.visits.make import VisitConfig
 from tests.changed import FIT, FIT_OPTIONS, Changed, write_changed
@@ -189,6 +191,28 @@ def test_what_the_readme_shows_in_python(small, changed, work, tmp_path, monkeyp
     assert [o.kind for o in names["visit"].change.objects] == ["moved"]
     assert torch.allclose(names["visit"].change.objects[0].shift, changed.truth.shift, atol=0.05)
     assert refield.open("work").visits == ()
+
+
+def test_what_the_readme_shows_to_be_typed(changed, tmp_path, monkeypatch, capsys) -> None:
+    """Every command of README.md in its order, with small steps; the demo's line is the tour's, too."""
+    for name in ("before", "after"):
+        shutil.copytree(changed.folder / name, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    small, pages = {"train": FIT_OPTIONS, "update": ["--update.steps", "40"], "view": ["--port", "0"]}, []
+
+    def look(viewer) -> None:
+        pages.append(urlopen(viewer.url).read())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "look_again", look)
+    monkeypatch.setattr("webbrowser.open", lambda url: pages.append(url))
+    lines = [shlex.split(line, comments=True)[1:] for line in typed(ROOT / "README.md")]
+    assert [line[0] for line in lines] == ["demo", "check", "train", "update", "render", "view"]
+    for command, *arguments in lines[1:]:
+        assert main([command, *arguments, *small.get(command, [])]) == 0, command
+    assert "1 object changed: 1 moved" in capsys.readouterr().out
+    assert Path("work/visits/001/report.html").is_file() and Path("film.webp").stat().st_size > 10_000
+    assert len(pages) == 2 and b"<html" in pages[1]
 
 
 def test_the_tour_is_walked(tmp_path, monkeypatch, capsys) -> None:

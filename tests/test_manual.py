@@ -54,7 +54,7 @@ def test_a_page_holds_every_option_of_its_command(command: str) -> None:
 
 def test_what_is_told_of_an_option_is_on_its_page() -> None:
     page = options().page("train")
-    assert "| `--fit.max-seconds {None}|FLOAT` | stop in time: the learning rate" in page and "| `None` |" in page
+    assert "| `--fit.max-seconds {None}|FLOAT` | stop after so long. The learning rate" in page and "| `None` |" in page
     assert "| `DATA` | a folder of photos or videos" in page and "refield train work --more" in page
     assert "[`refield undo`](undo.md)" in options().contents()
 

@@ -9,6 +9,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -31,9 +32,9 @@ from refield.report.pictures import IN_COLOUR, OUT_COLOUR, data_uri, marks_uri
 from refield.report.visit import object_shift, turn, uncertainty
 from refield.scene import pose
 from refield.scene.camera import Camera
-from refield.scene.capture import Frame
+from refield.scene.capture import Frame, camera_rays
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
-from tests.visit_pages import EVIL, visit_report
+from tests.visit_pages import CAMERA, EVIL, visit_report
 
 MOVE = pose.exp(torch.tensor([0.3, 0.0, 0.1, 0.0, 0.0, math.radians(30)], dtype=torch.float64))
 
@@ -277,3 +278,20 @@ def test_the_contact_sheet_shows_whole_rows_only(tmp_path: Path) -> None:
     assert [row[8 + 30 + k * 68].tolist()[0] for k in range(3)] == [255, 0, 128]
     with pytest.raises(ValueError, match="no view"):
         write_contact_sheet(tmp_path / "none.png", [view("b", before=None)])
+
+
+def test_the_scene_in_3d_is_where_the_photos_show_it() -> None:
+    report = visit_report()
+    told = json.loads(unescape(re.findall(r'data-space="([^"]*)"', html_page(report))[0]))
+    ways = [state["xyz"] for state in told["states"]]
+    assert ways[0] == ways[1] != ""  # the views' depths are the same
+    xyz = (np.frombuffer(base64.b64decode(ways[0]), "<u2").reshape(-1, 3) / 32767.5 - 1) * told["within"]
+    (was, now), (left, none), (never, came) = told["objects"]
+    assert none is None and never is None
+    unit = 1 / np.linalg.norm(np.mean(now, 0) - np.mean(was, 0))  # it was moved by 1
+    assert np.mean(was[4:], 0)[2] - np.mean(was[:4], 0)[2] == pytest.approx(0.75 / unit, rel=0.05)
+    assert len(left) == len(came) == 8
+    ends = 6 * camera_rays(CAMERA, torch.eye(4, dtype=torch.float64)).directions  # up is -y
+    assert np.ptp(xyz[:, 2]) * unit == pytest.approx(float(ends[:, 1].max() - ends[:, 1].min()), rel=0.05)
+    few = replace(report, photos=tuple(replace(p, depth_after=None) for p in report.photos))
+    assert "data-space" not in html_page(few) and "data-space" not in html_page(VisitReport("x", SceneChange()))

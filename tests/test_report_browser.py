@@ -116,6 +116,31 @@ def test_it_loads_in_silence_and_asks_for_nothing(opened: Any, name: str) -> Non
     assert len(pictures) > 3 and all(pictures)
 
 
+def test_the_scene_in_3d_is_turned_and_shows_both_states(opened: Any) -> None:
+    page = opened("visit").page
+    canvas = page.locator(".space canvas")
+    canvas.scroll_into_view_if_needed()
+    at = (".space canvas", 0.5, 0.3)
+    assert main_channel(colour(page, *at)) == "green"
+    page.locator(".space input").uncheck()
+    assert main_channel(colour(page, *at)) == "red"
+    badges = page.locator(".space .stage .no:visible")
+    assert badges.all_inner_texts() == ["1", "1", "2", "3"]
+    there = badges.first.bounding_box()["x"]
+    place = canvas.bounding_box()
+    middle = place["x"] + place["width"] / 2, place["y"] + place["height"] / 2
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 60, middle[1], steps=3)
+    page.mouse.up()
+    page.wait_for_function(f"document.querySelector('.space .no').getBoundingClientRect().x != {there}")
+    turned = colour(page, *at)
+    canvas.press("ArrowLeft")
+    canvas.press("-")
+    page.wait_for_timeout(100)  # a picture
+    assert badges.first.bounding_box()["x"] != there and main_channel(turned) == "red"
+
+
 @pytest.mark.parametrize("width", [1280, 400, 320])
 @pytest.mark.parametrize("name", ["visit", "history"])
 def test_no_page_scrolls_sideways(opened: Any, name: str, width: int) -> None:
@@ -181,7 +206,7 @@ def test_pictures_are_enlarged_by_keyboard(opened: Any) -> None:
     small = page.locator(".pair .stage").first.bounding_box()["width"]
     for _ in range(40):
         page.keyboard.press("Tab")
-        if page.evaluate("document.activeElement.className") == "enlarge":
+        if "Photo 1" in page.evaluate("document.activeElement.getAttribute('aria-label') ?? ''"):
             break
     name = page.evaluate("document.activeElement.getAttribute('aria-label')")
     assert name == "Enlarge Photo 1 (a.png): before and after"

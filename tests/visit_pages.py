@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -63,7 +64,9 @@ def view(name: str, x: float = 0.0, *, marked: bool = True) -> Comparison:
     masks = torch.zeros(3, CAMERA.height, CAMERA.width, dtype=torch.bool)
     masks[0, 14:26, 18:28], masks[1, 14:26, 8:18], masks[2, 2:6, 2:6] = True, True, True
     pictures = plain(BLUE), plain(RED), plain(GREEN)
-    return Comparison(name, *pictures, *(masks if marked else ()), frame=frame(name, x))  # type: ignore[arg-type, misc]
+    wall = torch.full((CAMERA.height, CAMERA.width), 6.0)
+    out = Comparison(name, *pictures, *(masks if marked else ()), frame=frame(name, x))  # type: ignore[arg-type, misc]
+    return replace(out, depth_before=wall, depth_after=wall)
 
 
 def visit_report(world: World | None = WORLD, number: int | None = 2) -> VisitReport:

@@ -19,7 +19,7 @@ from refield.artefacts import LOCK, locked
 from refield.cli import main
 from refield.export.gltf import ROOT, quaternion, upright
 from refield.export.recipe import ExportConfig, export
-from refield.export.surface import cells_of
+from refield.export.surface import Points, _depth_near, cells_of
 from refield.field.render import render_camera
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.colmap import load_colmap
@@ -419,3 +419,18 @@ def test_cells_have_numbers_of_their_own():
     cells = cells_of(xyz, torch.full((len(xyz),), 2**-4))
     pairs = torch.unique(torch.stack([exact, cells], 1), dim=0)
     assert len(pairs) == int(exact.max()) + 1 == int(cells.max()) + 1
+
+
+def test_a_point_is_where_the_light_ends():
+    """In a half space of constant density light goes in by the density's inverse on the mean."""
+
+    class Half:
+        def density(self, x):
+            return torch.where(x[..., 2] < 0, 50.0, 0.0)
+
+    xyz = torch.tensor([[0.0, 0.0, 0.03], [1.0, 0.0, -0.05]])
+    same = torch.full((2,), 0.05)
+    points = Points(xyz, xyz, same, xyz, xyz, same, xyz)
+    behind, opacity = _depth_near(Half(), points, torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3))
+    assert torch.allclose(behind, xyz[:, 2] + 1 / 50, atol=0.006)  # half a step
+    assert (opacity > 0.99).all()

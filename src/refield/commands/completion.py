@@ -73,7 +73,7 @@ def run(options: Completion) -> Answer:
 
 def script(shell: Literal["bash", "zsh", "fish"]) -> str:
     """What the shell is to read; it runs nothing but Python's interpreter, and loads nothing of ours."""
-    kinds: dict[str, Callable[..., Any]] = {name: shown(kind_of(name), whole=True) for name in COMMANDS}
+    kinds: dict[str, Callable[..., Any]] = {name: shown(kind_of(name)) for name in COMMANDS}
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
         subcommand_cli_from_dict(kinds, prog="refield", args=["--tyro-print-completion", shell])

@@ -50,39 +50,40 @@ class Render:
     work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace"""
     out: Path
-    """a film, if it ends in .mp4 (needs the extra 'video'), .gif or .webp; else the folder for the pictures, as PNG"""
+    """a film, if it ends in .mp4, .gif or .webp; else the folder for the pictures, as PNG. MP4 needs
+    the extra 'video'"""
     orbit: bool = False
-    """around what the photos look at, from where photographers stood; ends where it began"""
+    """around what the photos look at. From where photographers stood; ends where it began"""
     like_photos: bool = False
     """as each photo of the capture was taken, one by one"""
     path: Path | None = None
-    """a transforms.json whose views a smooth path leads through (its images need not exist), in the world of the
-    workspace's photos; or the word photos, for a tour through the photos' own places"""
+    """through the views of a transforms.json; or the word photos, for a tour of their own places. The path is smooth;
+    the views are in the world of the workspace's photos, and their images need not exist"""
     cameras: Path | None = None
-    """a transforms.json whose views are shown one by one, in PNGs of their names"""
+    """the views of a transforms.json, one by one. The PNGs have their names"""
     visit: int | None = None
-    """the state to show: 0 is before any visit; the latest by default"""
+    """which state: 0 is before any visit; the latest by default"""
     between: tuple[int, ...] = ()
-    """from state to state, as 0 1, or 0 1 2: on the way that is chosen, or standing where most changes"""
+    """from state to state, as 0 1, or 0 1 2. On the way that is chosen, or standing where most changes"""
     blend: Blend = "wipe"
-    """how one state goes over into the next; a fade takes longer on a way, as both are rendered"""
+    """how one state goes over into the next. A fade takes longer on a way, as both are rendered"""
     frames: int | None = None
     """how many pictures"""
     seconds: float | None = None
-    """how long the film is; by default 6 for an orbit, 1.5 for each part of a path, 10 for a tour, 4 for each change"""
+    """how long the film is. By default 6 for an orbit, 1.5 for each part of a path, 10 for a tour, 4 for each change"""
     fps: float | None = None
-    """pictures a second: 24 by default, 2 of views that are shown one by one"""
+    """pictures a second. 24 by default, 2 of views that are shown one by one"""
     size: int | None = None
-    """the longer side in pixels; by default the photos', on a path 960 at most"""
+    """the longer side in pixels. By default the photos', on a path 960 at most"""
     depth: bool = False
-    """depths too, as 16-bit PNGs in a folder of their own, with scale.json"""
+    """depths too, as 16-bit PNGs in a folder of their own. With scale.json"""
     opacity: bool = False
-    """how much of the light each pixel holds back, too, as 8-bit PNGs in a folder of their own"""
+    """opacities too, as 8-bit PNGs in a folder of their own. How much of the light each pixel holds back"""
     look: str | None = None
-    """a photo of the workspace's capture whose exposure, white balance and vignetting the pictures have; by default the
-    photos' mean exposure, and no vignetting"""
+    """a photo of the capture that the pictures are to look like. They have its exposure, white balance and vignetting;
+    by default the photos' mean exposure, and no vignetting"""
     overwrite: bool = False
-    """replace pictures and films at ``out`` that refield did not write"""
+    """replace what refield did not write at ``out``"""
     output: OmitArgPrefixes[Output] = PLAIN
 
 

@@ -46,21 +46,21 @@ class Train:
     work: Annotated[Path, arg(metavar="WORK"), Positional] = Path()
     """the workspace to make"""
     quality: Quality = "good"
-    """draft takes a minute at most, good some minutes, best some tens of minutes: on two cores, and of large captures;
+    """draft takes a minute at most, good some minutes, best some tens of minutes. On two cores, and of large captures;
     small ones take less. What ``fit`` options say goes before it; a 0 there leaves it to the quality"""
     more: bool = False
-    """go on with the fit of a workspace, given in place of DATA, from where it stood"""
+    """go on with the fit of a workspace, given in place of DATA. From where it stood"""
     overwrite: bool = False
     """replace the workspace that is there, with its visits"""
     scale: float | None = None
-    """metres per unit of the world, if you know them: lengths are then told in metres too"""
+    """metres per unit of the world, if you know them. Lengths are then told in metres too"""
     poses: FromPhotosConfig = field(default_factory=FromPhotosConfig)
     """photos without poses: how they are taken in, and how their poses are found"""
     architecture: Literal["hash", "nerfacto", "nerfacto-reduced"] = "hash"
-    """of the field: hash, which fits on a CPU in less than a minute; NeRFacto, for long fits; or that one reduced to
-    what a CPU can train in minutes (heeds the limit, seed and photos of ``nerfacto``)"""
+    """of the field: hash, for a CPU; nerfacto, for long fits; or that one reduced. Hash fits in less than a minute;
+    reduced, NeRFacto trains on a CPU in minutes (and heeds the limit, seed and photos of ``nerfacto``)"""
     route: Literal["paper", "paper-reduced"] | None = None
-    """as refield update wants it with the same option: nerfacto, or that reduced; exposures are not sought"""
+    """as refield update wants it with the same option. It is nerfacto, or that reduced; exposures are not sought"""
     fit: FitConfig = OPEN
     nerfacto: NerfactoFitConfig = field(default_factory=NerfactoFitConfig, metadata={"usual": False})
     output: OmitArgPrefixes[Output] = PLAIN

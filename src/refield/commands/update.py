@@ -46,10 +46,11 @@ class Update:
     photos: Annotated[Path, arg(metavar="PHOTOS"), Positional]
     """the new photos: their folder; or a transforms.json or its folder, with poses in the world of the old ones"""
     route: Literal["refield", "paper", "paper-reduced"] | None = None
-    """the steps of refield or, in a workspace that refield train made with the same option, those of the paper;
-    paper-reduced: with fewer rays, for a CPU. Sets both estimate.route and update.route, which choose one half each"""
+    """the steps of refield, those of the paper, or these with fewer rays, for a CPU. Those of the paper take a
+    workspace that refield train made with the same option. Sets both estimate.route and update.route, which choose one
+    half each"""
     evaluation: Path | None = None
-    """a folder of further photos (transforms.json, images/, masks_in/, masks_out/) to measure by"""
+    """a folder of further photos, to measure by. With transforms.json, images/, masks_in/ and masks_out/"""
     exit_code: Annotated[bool, FlagCreatePairsOff] = False
     """end with 10 if objects changed, 11 if something changed that is not understood, 0 if nothing did"""
     intake: PhotoConfig = field(default_factory=PhotoConfig)

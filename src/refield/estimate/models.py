@@ -30,16 +30,16 @@ class ModelConfig:
     """Which of them; those with weights read them from a local folder (docs/weights.md)."""
 
     segmenter: Literal["grabcut", "sam", "sam-hq", "sam2", "sam3"] = field(default="grabcut", metadata={"usual": True})
-    """cuts things out of pictures; all but grabcut need weights"""
+    """cuts things out of pictures. All but grabcut need weights"""
     segmenter_weights: Path | None = field(default=None, metadata={"usual": True})
     """folder with config.json and *.safetensors"""
     matcher: Literal["sift", "lightglue", "superglue"] = field(default="sift", metadata={"usual": True})
-    """finds corresponding points; all but sift need weights"""
+    """finds corresponding points. All but sift need weights"""
     matcher_weights: Path | None = field(default=None, metadata={"usual": True})
     """folder with config.json and *.safetensors"""
-    describer: Literal["vlad", "dinov2"] = field(default="vlad", metadata={"usual": True})
+    describer: Literal["vlad", "dinov2"] = "vlad"
     """finds old photos that look like a new one without a pose; dinov2 needs weights"""
-    describer_weights: Path | None = field(default=None, metadata={"usual": True})
+    describer_weights: Path | None = None
     """folder with config.json and *.safetensors"""
     device: Literal["cpu", "cuda"] = "cpu"
     """where models with weights run"""

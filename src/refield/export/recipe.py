@@ -16,8 +16,9 @@ from refield.export.cameras import write_cameras
 from refield.export.changes import name_of, write_changes
 from refield.export.mesh import FACES, mesh_of, need_a_mesh, write_mesh
 from refield.export.objects import points_in
+from refield.export.seen import Progress, View, views_of
 from refield.export.splats import discs_of, splats_of, write_splats
-from refield.export.surface import POINTS, Points, Progress, Surface, View, surface_of, views_of
+from refield.export.surface import POINTS, Points, Surface, surface_of
 from refield.history import state
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import ObjectChange, SceneChange

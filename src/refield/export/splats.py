@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from refield.export.surface import Points, Surface, View, cells_of, mean_over
+from refield.export.seen import View
+from refield.export.surface import Points, Surface, cells_of, mean_over
 
 WIDE = 0.5
 """deviations of a disc, in distances between neighbours: wider is blurred, narrower has holes"""
@@ -62,7 +63,7 @@ def splats_of(surface: Surface, views: Sequence[View], around: int = DOME) -> Sp
 def discs_of(points: Points) -> Splats:
     """One for each point."""
     wide = WIDE * torch.minimum(points.spacing, _LARGEST * points.footprint)
-    return _discs(points.xyz, points.normal, wide, points.rgb)
+    return _discs(points.drawn, points.normal, wide, points.rgb)
 
 
 def _discs(means: Tensor, normals: Tensor, wide: Tensor, rgb: Tensor) -> Splats:

@@ -34,11 +34,11 @@ class FitConfig:
     steps: int = 2000
     """of gradient descent"""
     max_seconds: float | None = field(default=None, metadata={"usual": True})
-    """stop in time: the learning rate follows whichever of steps and seconds is further on; compiling is not counted"""
-    photo_memory: float | None = field(default=None, metadata={"usual": True})
-    """GB for the photos' pixels; of more than fit, a part is kept, drawn from every photo alike"""
+    """stop after so long. The learning rate follows whichever of steps and seconds is further on; compiling is free"""
+    photo_memory: float | None = None
+    """GB for the photos' pixels. Of more than fit, a part is kept, drawn from every photo alike"""
     device: Literal["cpu", "cuda"] = field(default="cpu", metadata={"usual": True})
-    """where the fit runs; the field comes back to the CPU. The CUDA path was tested in an interpreter, not on a GPU"""
+    """where the fit runs. The field comes back to the CPU. The CUDA path was tested in an interpreter, not on a GPU"""
     samples: int = 8192
     """a step; the rays follow from how many samples each needs, and behind the first surface it needs none"""
     samples_per_ray: float = 40

@@ -38,7 +38,7 @@ class PhotoModelConfig:
     """exposure and white balance of each photo, vignetting of each camera, where they differ; by default as the quality
     says, and not without one"""
     poses: bool = field(default=False, metadata={"usual": True})
-    """where each photo was taken and what its lens is, a few pixels around what is given"""
+    """where each photo was taken and what its lens is, too. A few pixels around what is given"""
     trust: bool = False
     """parts of single photos that show what no other does count for less"""
 

@@ -35,7 +35,7 @@ class PhotoConfig:
     """How photos without poses are taken in."""
 
     longest: int = field(default=1600, metadata={"usual": True})
-    """pixels of the longer side; larger photos are scaled down to it"""
+    """pixels of the longer side, at most. Larger photos are scaled down to it"""
     video_frames: int = 120
     """taken from a video: the sharpest, spread over its length"""
 

@@ -1,7 +1,7 @@
 """A visit's page: one HTML text with its style, its few lines of script and its pictures inside.
 
-It is complete without the script, which turns pairs of pictures into sliders and enlarges them. Whatever comes from
-files or from the user passes `html.escape`; the page fetches nothing.
+It is complete without the script, which turns pairs of pictures into sliders, enlarges them and shows the scene in 3-D.
+Whatever comes from files or from the user passes `html.escape`; the page fetches nothing.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from importlib import resources
 
 from refield.report import words
 from refield.report.plan import Thing, plan
+from refield.report.space import space
 from refield.report.tables import technical
 from refield.report.views import ALL_PIXELS, MOST_VIEWS, card, legend, pictures_in, spots_in
 from refield.report.visit import Comparison, VisitReport
@@ -39,7 +40,7 @@ def html_page(report: VisitReport) -> str:
 
 def document(title: str, parts: Iterable[str]) -> str:
     """A page of ours around its parts."""
-    style, script = (_resource(name) for name in ("style.css", "page.js"))
+    style, script = _resource("style.css"), _resource("page.js") + _resource("space.js")
     # no other script runs, whatever a text from outside holds
     known = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = (
@@ -85,6 +86,7 @@ def _parts(report: VisitReport) -> Iterable[str]:
     yield _changed(objects, world, plan(things, world, cameras, report.old_frames), note)
     rejected = {p.name for p in report.change.photos if p.status == "rejected"}
     photos = [v for v in report.photos if v.name not in rejected]
+    yield space(photos, objects, world)
     views = report.evaluation_views[:MOST_VIEWS]
     most = ALL_PIXELS / max(pictures_in([*photos, *views]), 1)
     heads = (_BY_HAND, "View") if report.change.by_hand else ("New photos", "Photo")

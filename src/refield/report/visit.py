@@ -51,6 +51,10 @@ class Comparison:
     """(H, W) bool: changed pixels that are not understood"""
     frame: Frame | None = None
     """where it was taken, so that objects are numbered in it; None: they are not"""
+    depth_before: Tensor | None = None
+    """(H, W) of ``before``, along the rays, in world units; inf where no surface is"""
+    depth_after: Tensor | None = None
+    """likewise of ``after``"""
 
     @property
     def marked(self) -> bool:

@@ -20,8 +20,9 @@ from torch import Tensor
 
 from refield.artefacts import FACTS
 from refield.estimate.look import spread_out
+from refield.export.seen import ends_of, views_of
 from refield.export.splats import WIDE, Splats, splats_of
-from refield.export.surface import cells_of, ends_of, mean_over, surface_of, views_of
+from refield.export.surface import cells_of, mean_over, surface_of
 from refield.field.radiance import Field
 from refield.history import changed_visits
 from refield.scene.capture import Frame

@@ -23,7 +23,7 @@ from refield.scene.pose import invert, nearest_rotation, rigid, transform
 from refield.update.store import save_updated
 from refield.update.train import update_field
 from refield.visits.make import SHOWN
-from refield.visits.page import page
+from refield.visits.page import page, surface_depth
 from refield.visits.telling import Telling
 from refield.visits.visit import Visit
 from refield.workspace import Workspace
@@ -54,7 +54,7 @@ def move_by_hand(workspace: Workspace, grid: OccupancyGrid, new_from_old: Tensor
         new = update_field(capture, old, change, on_stage=telling.stage)
         telling.stage("report")
         frames = _best_views(capture, change)
-        shown = tuple(Comparison(f.name, None, before=_shown(old, f), after=_shown(new, f), frame=f) for f in frames)
+        shown = tuple(_compared(old, new, f) for f in frames)
         with workspace.new_visit() as folder:
             workspace.keep_change(folder, change)
             save_updated(folder, new)
@@ -103,5 +103,9 @@ def _best_views(capture: Capture, change: SceneChange) -> list[Frame]:
     return sorted(spread_out(capture.frames, _GLANCES), key=seen, reverse=True)[:_VIEWS]
 
 
-def _shown(field: Field, frame: Frame) -> Tensor:
-    return render_camera(field, frame.camera.within(SHOWN), frame.world_from_cam).rgb
+def _compared(old: Field, new: Field, frame: Frame) -> Comparison:
+    """What the two show from a photo's place."""
+    camera = frame.camera.within(SHOWN)
+    before, after = (render_camera(field, camera, frame.world_from_cam) for field in (old, new))
+    depths = surface_depth(before), surface_depth(after)
+    return Comparison(frame.name, None, before.rgb, after.rgb, None, None, None, frame, *depths)

@@ -8,13 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from torch import Tensor
-
 from refield.estimate.localize import LocalizeConfig
 from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.evaluate import evaluate, looked_over
 from refield.field.radiance import Field
 from refield.field.render import render_camera
+from refield.field.volrend import Rendering
 from refield.history import known_objects, retouched, state
 from refield.photos.sources import find_sources
 from refield.photos.taken import PhotoConfig
@@ -171,6 +170,6 @@ def _updated(
         return update_field(capture, old, change, config, on_stage=telling.stage, on_progress=line)
 
 
-def _shown(field: Field, change: SceneChange) -> list[Tensor]:
-    """What a field shows from where each used new photo was taken, (H, W, 3) each, of about `SHOWN` pixels at most."""
-    return [render_camera(field, f.camera.within(SHOWN), f.world_from_cam).rgb for f in change.frames]
+def _shown(field: Field, change: SceneChange) -> list[Rendering]:
+    """What a field shows from where each used new photo was taken, of about `SHOWN` pixels at most."""
+    return [render_camera(field, f.camera.within(SHOWN), f.world_from_cam) for f in change.frames]

@@ -4,25 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import torch
 from torch import Tensor
 
 from refield.evaluate import Report
+from refield.field.volrend import Rendering
 from refield.report import Comparison, VisitReport
 from refield.scene.change import SceneChange
 from refield.scene.images import frame_image
 from refield.visits.telling import Telling
 
+_OPAQUE = 0.9  # of the light has to end in what is taken for a surface
+
 
 def page(
     title: str,
     change: SceneChange,
-    shown: tuple[Sequence[Tensor], Sequence[Tensor] | None],
+    shown: tuple[Sequence[Rendering], Sequence[Rendering] | None],
     telling: Telling,
     evaluation: Report | None,
     facts: Mapping[str, float | str],
 ) -> VisitReport:
-    """``shown`` are the pictures (H, W, 3) that the old field and the updated one (None if nothing changed) have of
-    the used new photos."""
+    """``shown`` is what the old field and the updated one (None if nothing changed) show, (H, W), from where the used
+    new photos were taken."""
     return VisitReport(
         title,
         change,
@@ -56,8 +60,13 @@ def marked_photos(change: SceneChange) -> tuple[Comparison, ...]:
     return tuple(view for view in _photos(change, None, None) if view.photo is not None)
 
 
+def surface_depth(shown: Rendering) -> Tensor:
+    """A rendering's depth, inf where no surface is."""
+    return torch.where(shown.opacity > _OPAQUE, shown.depth, torch.inf)
+
+
 def _photos(
-    change: SceneChange, before: Sequence[Tensor] | None, after: Sequence[Tensor] | None
+    change: SceneChange, before: Sequence[Rendering] | None, after: Sequence[Rendering] | None
 ) -> tuple[Comparison, ...]:
     out, used = [], 0
     for photo in change.photos:
@@ -69,8 +78,10 @@ def _photos(
             Comparison(
                 name=photo.name,
                 photo=frame_image(frame),
-                before=None if before is None else before[used],
-                after=None if after is None else after[used],
+                before=None if before is None else before[used].rgb,
+                after=None if after is None else after[used].rgb,
+                depth_before=None if before is None else surface_depth(before[used]),
+                depth_after=None if after is None else surface_depth(after[used]),
                 mask_in=change.masks_in[used] if change.masks_in else None,
                 mask_out=change.masks_out[used] if change.masks_out else None,
                 unclear=change.unexplained[used] if change.unexplained else None,
