@@ -60,7 +60,7 @@ def photos(world: Field, turns: Sequence[float]) -> Lessons:
         near = render_many(world, rays)
         first = (near.depth < t - 0.05) & (near.opacity > 0.5)
         rgb = torch.where(first[:, None], near.rgb, exact)
-        parts.append(Lessons(rays, rgb, torch.full((n,), i), torch.arange(n)))
+        parts.append(Lessons(rays, rgb, torch.full((n,), i), torch.arange(n), torch.zeros(n, dtype=torch.bool)))
     first, *rest = parts
     for part in rest:
         first = first.followed_by(part)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -37,7 +39,9 @@ def lessons(factor: float = 1.0) -> tuple[Lessons, Tensor]:
     count = len(rays) // 3
     photo, place = torch.arange(3).repeat_interleave(count), torch.arange(count).repeat(3)
     seen = factor * render_many(UpdatedField(BEFORE, CHANGE, helper=AFTER), rays).rgb
-    return Lessons(rays, seen, photo, place), (was - now).abs().amax(-1) > 0.02
+    return Lessons(rays, seen, photo, place, torch.ones_like(place, dtype=torch.bool)), (was - now).abs().amax(
+        -1
+    ) > 0.02
 
 
 def test_light_that_is_wrong_is_left_out_and_the_rest_kept() -> None:
@@ -66,7 +70,7 @@ def test_a_helper_that_is_wrong_about_the_surroundings_keeps_to_what_left() -> N
 def test_what_no_pixel_contradicts_stays() -> None:
     updated = UpdatedField(BEFORE, CHANGE, helper=AFTER)
     new, changed = lessons()
-    new = Lessons(new.rays, render_many(updated, new.rays).rgb, new.photo, new.place)
+    new = replace(new, rgb=render_many(updated, new.rays).rgb)
     assert spared(updated, new, changed) == Spared(updated)
     assert spared(updated, new, torch.ones_like(changed)) == Spared(updated)
 
@@ -77,5 +81,5 @@ def test_a_part_that_changed_pixels_need_stays_and_its_cost_is_told() -> None:
     new, _ = lessons()
     changed = torch.arange(len(new)) % 3 > 0
     rgb = torch.where(changed[:, None], render_many(wrong, new.rays).rgb, new.rgb)
-    kept = spared(wrong, Lessons(new.rays, rgb, new.photo, new.place), changed)
+    kept = spared(wrong, replace(new, rgb=rgb), changed)
     assert kept.field is wrong and kept.left_out == () and kept.lost > 1

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from refield.field.radiance import Field
+from refield.field.radiance import Field, HashField
 from refield.field.render import render_camera, render_many
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
@@ -18,8 +19,9 @@ from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.images import write_image
 from refield.update import train
 from refield.update.config import UpdateConfig
-from refield.update.light import Sightings
-from refield.update.supervision import changed_pixels, places_of
+from refield.update.fit_helper import HelperTraining, Lit
+from refield.update.light import Relighting, Sightings
+from refield.update.supervision import Lessons, changed_pixels, places_of
 from refield.update.train import UpdateProgress, update_field
 from refield.vision.pixels import dilate
 from tests.update.worlds import Ball, BallWorld, at, looking_from, moved
@@ -30,7 +32,7 @@ OLD = Ball(at(-0.35, 0.1, 0.22), 0.25)  # it has sunk into the floor: a dent the
 NEW_POSE = at(0.45, -0.3, 0.22, yaw=0.6)
 NEW = Ball(NEW_POSE, 0.25)
 BEFORE, AFTER = BallWorld((OLD,)), BallWorld((NEW,))
-QUICK = UpdateConfig(steps=300, max_seconds=60)
+QUICK = UpdateConfig(steps=300, max_seconds=600)
 
 
 class Hidden:
@@ -116,6 +118,49 @@ def test_light_is_learnt_up_to_the_objects_edges(
     assert (told & ring).sum() > 0.5 * ring.sum()
 
 
+def test_the_seed_alone_says_what_is_drawn(case: tuple[Capture, SceneChange]) -> None:
+    capture, change = case
+    few, tables = replace(QUICK, steps=20), []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        updated, drawn = update_field(capture, OLD_FIELD, change, few), torch.rand(1)
+        torch.manual_seed(seed)
+        assert torch.equal(drawn, torch.rand(1)), "torch's own generator was drawn from"
+        assert isinstance(updated.helper, HashField)
+        tables.append((updated.helper.encoding.tables, updated.sampler.grid))
+    assert all(torch.equal(a, b) for a, b in zip(*tables))
+
+
+def test_what_judges_is_never_fitted_to(case: tuple[Capture, SceneChange], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither light nor shading, ground or helper; and the parts of the update are judged by nothing else."""
+    capture, change = case
+    taught: list[Lessons] = []
+    judged: list[Lessons] = []
+
+    def wrapped(name: str, told: list[Lessons], at: int) -> None:
+        own = getattr(train, name)
+        monkeypatch.setattr(train, name, lambda *given, **more: (told.append(given[at]), own(*given, **more))[1])
+
+    wrapped("_shading", taught, 0)
+    wrapped("textured_planes", taught, 5)
+    wrapped("spared", judged, 1)
+    lights: list[int] = []
+    monkeypatch.setattr(train, "fit_light", lambda seen, *more: lights.append(len(seen.x)))
+    own = train.HelperTraining
+
+    def watched(helper: HashField, frozen: Field, sparse: Lit, old: Lit, judge: Lit, *more: Any) -> HelperTraining:
+        taught.extend([sparse.lessons, old.lessons])
+        judged.append(judge.lessons)
+        return own(helper, frozen, sparse, old, judge, *more)
+
+    monkeypatch.setattr(train, "HelperTraining", watched)
+    update_field(capture, OLD_FIELD, change, replace(QUICK, steps=1))
+    assert len(taught) == 4 and len(judged) == 2 and lights
+    assert all(len(t) and not t.held.any() for t in taught) and all(len(j) and j.held.all() for j in judged)
+    everything = sum(f.camera.width * f.camera.height for f in change.frames)
+    assert max(lights) <= len(taught[0]) < 0.97 * everything
+
+
 def test_without_new_photos_things_are_only_moved(case: tuple[Capture, SceneChange]) -> None:
     capture, change = case
     blind = SceneChange(change.objects)
@@ -137,3 +182,16 @@ def test_photos_that_look_away_only_move_things(case: tuple[Capture, SceneChange
     photo = replace(change.photos[0], frame=replace(change.frames[0], world_from_cam=away))
     updated = update_field(capture, OLD_FIELD, SceneChange(change.objects, (photo,)), replace(QUICK, steps=50))
     assert len(updated.moves) == 1 and math.isfinite(error(updated))
+
+
+def test_light_stays_where_no_photo_shows_what_left(
+    case: tuple[Capture, SceneChange], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is learnt of the light does not hang on there being something for a helper to learn."""
+    capture, change = case
+    light = Relighting(torch.tensor([[-2.0, -2, -2], [2, 2, 2]]), torch.zeros(3, 3, 3, 3))
+    monkeypatch.setattr(train, "fit_light", lambda *given: light)
+    monkeypatch.setattr(train, "meets", lambda sampler, rays: torch.zeros(len(rays), dtype=torch.bool))
+    updated = update_field(capture, OLD_FIELD, change, QUICK)
+    assert updated.light is light and updated.shading == (None,) and updated.helper is None
+    assert "nothing could be learnt" in updated.why_stopped

@@ -80,11 +80,11 @@ def test_a_helper_is_told_what_was_looked_through() -> None:
     zeros = torch.zeros
     rays = Rays(zeros(0, 3), zeros(0, 3))
     nothing = Lit(
-        Lessons(rays, zeros(0, 3), *(zeros(0, dtype=torch.long) for _ in range(2))),
+        Lessons(rays, zeros(0, 3), *(zeros(0, dtype=torch.long) for _ in range(2)), zeros(0, dtype=torch.bool)),
         Segments(zeros(0), zeros(0), zeros(0, 3), zeros(1, dtype=torch.long)),
     )
     sight = sight_of(frozen.pretrained, frames(), [BOX])
     x = torch.tensor([[0.7, 0.0, 0.0], [0.0, 0.0, 0.48]])  # beside the ball; at its surface
     for known, tolls in ((sight, [UpdateConfig.emptiness, 0.0]), (None, [0.0, 0.0])):
-        run = HelperTraining(helper, frozen, nothing, nothing, nothing, UpdateConfig(), (), known)
+        run = HelperTraining(helper, frozen, nothing, nothing, nothing, UpdateConfig(), torch.Generator(), (), known)
         assert run.misplaced[helper.sampler.cells(x)].tolist() == pytest.approx(tolls)

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.descent import NonFiniteError, TableAdam
-from refield.field.fit import rate_factor
 from refield.field.kernels.reference import Aim, Batch, Fixed, Unwanted
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP
+from refield.field.schedule import at_plateau, rate_factor
 from refield.field.volrend import Samples, accumulate_rgb
 from refield.scene.capture import Rays
 from refield.update.composite import UpdatedField
@@ -60,16 +60,17 @@ class HelperTraining:
         old: Lit,
         judge: Lit,
         config: UpdateConfig,
+        draw: torch.Generator,
         ground: Sequence[Foothold] = (),
         sight: Sight | None = None,
     ) -> None:
-        self.helper, self.config, self.frozen = helper, config, frozen
+        self.helper, self.config, self.frozen, self.draw = helper, config, frozen, draw
         lessons, fixed = sparse.lessons.followed_by(old.lessons), Segments.joined([sparse.fixed, old.fixed])
         self.taught, self.new_rays, self.judge = Lit(lessons, fixed), len(sparse.lessons), judge
         added = tuple(o.grid for o in frozen.change.objects if o.kind == "added")
         taken = Region(added + frozen.bare.grids)
         self.misplaced = config.emptiness * emptiness(frozen.change, helper.sampler, taken, ground, sight)
-        self.occupancy = HelperOccupancy(helper)
+        self.occupancy = HelperOccupancy(helper, draw)
         self.adam = TableAdam(helper)
         self.rays_per_step, self.steps_done = 1024, 0
         self.why_stopped = "all steps done"
@@ -102,8 +103,7 @@ class HelperTraining:
                     best = {k: v.detach().clone() for k, v in self.helper.state_dict().items()}
                 if on_progress:
                     on_progress(UpdateProgress(step + 1, c.steps, looks[-1], time.perf_counter() - began))
-                n = c.patience
-                if len(looks) > n and max(looks[-n:]) < max(looks[:-n]) + c.least_gain:
+                if at_plateau(looks, c):
                     self.why_stopped = "held-out pixels stopped gaining"
                     break
         if looks and self.steps_done % c.check_every and self.psnr(self.judge) >= max(looks):
@@ -148,14 +148,17 @@ class HelperTraining:
         """Rays of a step, (N,) int64: the new photos' share of them first."""
         n, new, old = self.rays_per_step, self.new_rays, len(self.taught.lessons) - self.new_rays
         n_new = n if not old else round(n * self.config.sparse_share) if new else 0
-        return torch.cat([torch.randint(max(new, 1), (n_new,)), new + torch.randint(max(old, 1), (n - n_new,))])
+        shares = ((new, n_new), (old, n - n_new))
+        of_new, of_old = (torch.randint(max(most, 1), (k,), generator=self.draw) for most, k in shares)
+        return torch.cat([of_new, new + of_old])
 
     def _step(self, step: int, rate: float) -> None:
         chosen, helper, c = self._drawn(), self.helper, self.config
         n, lessons, fixed = len(chosen), self.taught.lessons, self.taught.fixed
         rays, sampler = lessons.rays[chosen], helper.sampler
         # what stays transparent is shown noise, so that only opaque surfaces explain the photos
-        batch = Batch((rays.origins, rays.directions, torch.rand(n)), lessons.rgb[chosen], torch.rand(n, 3))
+        jitter, shown = (torch.rand(*shape, generator=self.draw) for shape in ((n,), (n, 3)))
+        batch = Batch((rays.origins, rays.directions, jitter), lessons.rgb[chosen], shown)
         done = kernels.woven_step(
             batch,
             Fixed(fixed.t_mid, fixed.optical_depth, fixed.rgb, fixed.offsets, chosen),

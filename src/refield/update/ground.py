@@ -65,7 +65,7 @@ class Foothold:
         return torch.where(met, t, torch.inf)
 
 
-def planes_around(points: Tensor, box: Tensor, eyes: Tensor, resolved: float) -> list[Plane]:
+def planes_around(points: Tensor, box: Tensor, eyes: Tensor, resolved: float, draw: torch.Generator) -> list[Plane]:
     """Planes among surface points (N, 3) in and around a world box (2, 3).
 
     Args:
@@ -73,5 +73,5 @@ def planes_around(points: Tensor, box: Tensor, eyes: Tensor, resolved: float) ->
         resolved: how exact the points are, world units.
     """
     near = points[((points - box.mean(0)).abs() < (box[1] - box[0]).max()).all(-1)]
-    some = near[torch.randperm(len(near))[:_POINTS]].double().numpy()
+    some = near[torch.randperm(len(near), generator=draw)[:_POINTS]].double().numpy()
     return rough_planes(some, eyes.double().numpy(), resolved)

@@ -2,8 +2,8 @@
 
 Light, the light on each moved object, and what is told of the surroundings of what left and arrived (ground, helper)
 are fitted to a few photos. Where one of them shows unchanged pixels of those photos worse than the old field did, the
-update is better without it: the rest is kept. The photos that judge are those that taught: harm that shows only from
-elsewhere is not seen here. Letters: P pixels.
+update is better without it: the rest is kept. Pixels of the same photos judge that nothing was
+fitted to: harm that shows only from elsewhere is not seen here. Letters: P pixels.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def spared(updated: UpdatedField, new: Lessons, changed: Tensor) -> Spared:
     unchanged pixels gain the most first.
 
     Args:
-        new: pixels of the new photos.
+        new: pixels of the new photos that are kept to judge by.
         changed: (P,) bool, which of them show what arrived or left.
     """
     before, same = updated.unchanged(new.rays)

@@ -37,19 +37,32 @@ class Lessons:
     """(N,) int64: index of the new photo, or -1 for an old one"""
     place: Tensor
     """(N,) int64: the pixel's place in its photo, row by row"""
+    held: Tensor
+    """(N,) bool: kept to judge by; nothing is ever fitted to it"""
 
     def __len__(self) -> int:
         return len(self.rgb)
 
     def __getitem__(self, chosen: Tensor | slice) -> Lessons:
-        return Lessons(self.rays[chosen], self.rgb[chosen], self.photo[chosen], self.place[chosen])
+        parts = (part[chosen] for part in (self.rgb, self.photo, self.place, self.held))
+        return Lessons(self.rays[chosen], *parts)
+
+    @property
+    def taught(self) -> Lessons:
+        """Those that something may be fitted to."""
+        return self[(~self.held).nonzero()[:, 0]]
+
+    @property
+    def judging(self) -> Lessons:
+        """Those that are kept to judge by."""
+        return self[self.held.nonzero()[:, 0]]
 
     def followed_by(self, more: Lessons) -> Lessons:
         """These and then more."""
         origins = torch.cat([self.rays.origins, more.rays.origins])
         directions = torch.cat([self.rays.directions, more.rays.directions])
-        colours, photos = torch.cat([self.rgb, more.rgb]), torch.cat([self.photo, more.photo])
-        return Lessons(Rays(origins, directions), colours, photos, torch.cat([self.place, more.place]))
+        mine, others = ((s.rgb, s.photo, s.place, s.held) for s in (self, more))
+        return Lessons(Rays(origins, directions), *(torch.cat(parts) for parts in zip(mine, others)))
 
     def within(self, masks: Sequence[np.ndarray]) -> Tensor:
         """Which pixels are in the mask (H, W) bool of their new photo, (N,) bool."""
@@ -148,19 +161,25 @@ def changed_pixels(change: SceneChange, places: Places, index: int, frame: Frame
     return total
 
 
-def new_lessons(frames: Sequence[Frame], field: Field, changed: Sequence[np.ndarray]) -> Lessons:
-    """The new photos' pixels, in the old photos' exposure; of large photos some of them.
+def new_lessons(
+    frames: Sequence[Frame], field: Field, changed: Sequence[np.ndarray], held_out: int, draw: torch.Generator
+) -> Lessons:
+    """The new photos' pixels, in the old photos' exposure; of large photos some of them. One of ``held_out`` is drawn
+    to judge by, once for all that follows.
 
     ``field`` is the old one with the objects cut out and moved, ``changed`` each photo's `changed_pixels`.
     """
     bank = PixelBank(frames, masks=[_thinned(f) for f in frames])
     everything = torch.arange(len(bank))
-    out = Lessons(bank.rays(everything), bank.colours(everything), bank.frame_of(everything), bank.place_of(everything))
+    held = torch.rand(len(bank), generator=draw) * max(held_out, 2) < 1  # something has to be left to learn from
+    out = Lessons(
+        bank.rays(everything), bank.colours(everything), bank.frame_of(everything), bank.place_of(everything), held
+    )
     wide = [dilate(mask, math.ceil(_UNTOUCHED_MARGIN * mask.shape[1])) for mask in changed]
-    still = ~out.within(wide)
+    told = ~out.within(wide) & ~held
     for i in range(len(frames)):
         mine = slice(int(bank.starts[i]), int(bank.starts[i + 1]))
-        some = still[mine].nonzero()[:, 0]
+        some = told[mine].nonzero()[:, 0]
         some = mine.start + some[:: max(1, len(some) // _EXPOSURE_PIXELS)]
         affine = exposure(out.rgb[some], render_many(field, out.rays[some]).rgb)
         out.rgb[mine] = (out.rgb[mine] * affine[0] + affine[1]).clamp(0, 1)

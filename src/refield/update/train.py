@@ -76,18 +76,18 @@ def update_field(
         asked = config.paper if config.route == "paper" else reduced(config.paper)
         return update_field_paper(capture, field, change, asked, on_stage, on_progress)
     say = on_stage or (lambda name: None)
-    torch.manual_seed(config.seed)
+    draw = torch.Generator().manual_seed(config.seed)
     say("move")
     eyes = centres(capture.train).float()
     base, earlier = earlier_of(field, change, config.dilation)
     cut = UpdatedField(base, change, eyes=eyes, earlier=earlier)
     if not change.objects or not change.frames:
         return cut
-    known = _known_of(capture, field, cut)
+    known = _known_of(capture, field, cut, config.held_out, draw)
     cut = known.cut
     say("light")
-    light = _light(known) if config.relight else None
-    shading = _shading(known.sparse, cut, change) if config.relight else ()
+    light = _light(known, draw) if config.relight else None
+    shading = _shading(known.sparse.taught, cut, change, draw) if config.relight else ()
     lit = partial(
         UpdatedField,
         cut.pretrained,
@@ -109,27 +109,26 @@ def update_field(
     step = step_near(field, middle)
     near = _in_reach(wide.sampler(step), capture.train + change.frames)
     # what earlier visits know has been taken from them already; of the rest no old photo shows anything
-    old = _old_lessons(capture, cut, near, config, light) if cut.to_learn.objects else known.sparse[:0]
-    ground = _ground(known, old, wide, eyes, max(_pixel(change, middle), step))
-    rows = _some(meets(near, known.sparse.rays).nonzero()[:, 0], _NEW_RAYS)
-    held = _held_out(len(known.sparse), config.held_out)[rows]
-    sparse = known.sparse[rows]
-    if len(sparse) + len(old) == 0:  # no ray crosses the region: nothing could teach a helper
-        return cut
+    old = _old_lessons(capture, cut, near, config, light, draw) if cut.to_learn.objects else known.sparse[:0]
+    sparse = known.sparse[_some(meets(near, known.sparse.rays).nonzero()[:, 0], _NEW_RAYS, draw)]
+    if len(sparse) + len(old) == 0:
+        updated = lit(region=cut.region)
+        updated.why_stopped = "no photo shows any of it, so that nothing could be learnt"
+        return _without_harm(updated, known)
+    ground = _ground(known, old, wide, eyes, max(_pixel(change, middle), step), draw)
     sight = sight_of(cut.pretrained, capture.train, _beside(wide))
-    planes = _textured(known, ground, sight, config, _pixel(change, middle))
+    planes = _textured(known, ground, sight, config.ground, _pixel(change, middle))
     say("freeze")
     told, region = Region(wide.grids, planes), finer(without_planes(near, planes))
     frozen = lit(region=told).unshown(sight.hidden)
     if not region.grid.any():
         frozen.why_stopped = "there is nothing but the ground to show"
         return _without_harm(frozen, known)
-    fixed = _fixed(frozen, region, sparse.rays, ground)
-    new_taught, judge = (Lit(sparse[r], fixed[r]) for r in ((~held).nonzero()[:, 0], held.nonzero()[:, 0]))
-    old_taught = Lit(old, _fixed(frozen, region, old.rays, ground))
+    parts = (sparse.taught, old, sparse.judging)
+    taught, remembered, judge = (Lit(some, _fixed(frozen, region, some.rays, ground)) for some in parts)
     say("train")
     helper = new_helper(region, change.frames, config.seed)
-    run = HelperTraining(helper, frozen, new_taught, old_taught, judge, config, ground, sight)
+    run = HelperTraining(helper, frozen, taught, remembered, judge, config, draw, ground, sight)
     run.run(on_progress)
     say("show")
     helper.requires_grad_(False)
@@ -140,7 +139,8 @@ def update_field(
 
 def _without_harm(updated: UpdatedField, known: _Known) -> UpdatedField:
     """The update without the parts of it that show unchanged pixels worse; ``notes`` says which, and what it costs."""
-    kept = spared(updated, known.sparse, known.sparse.within(known.changed))
+    judging = known.sparse.judging
+    kept = spared(updated, judging, judging.within(known.changed))
     notes = [f"left out of the update: {o.part} (unchanged pixels gain {o.gain:.1f} dB)" for o in kept.left_out]
     if kept.lost >= _TOLD:
         notes.append(f"unchanged pixels beside what changed are shown {kept.lost:.1f} dB worse than before")
@@ -162,14 +162,14 @@ class _Known:
     """of each new photo, (H, W) bool: what only an earlier visit knows"""
 
 
-def _known_of(capture: Capture, field: Field, cut: UpdatedField) -> _Known:
+def _known_of(capture: Capture, field: Field, cut: UpdatedField, held_out: int, draw: torch.Generator) -> _Known:
     """What is known, once the new photos have been asked about what is only remembered."""
     change, eyes = cut.change, cut.eyes
     places = places_of(change)
     changed = tuple(changed_pixels(change, places, i, f) for i, f in enumerate(change.frames))
-    sparse = new_lessons(change.frames, cut, changed)
+    sparse = new_lessons(change.frames, cut, changed, held_out, draw)
     recalled = tuple(recalled_pixels(cut, f) for f in change.frames)
-    if cut.earlier and not as_remembered(cut, sparse, changed, recalled):
+    if cut.earlier and not as_remembered(cut, sparse, changed, recalled, draw):
         cut = UpdatedField(field, change, eyes=eyes)
         recalled = tuple(np.zeros_like(r) for r in recalled)
     bare = bare_skin(cut, capture.train, change)
@@ -192,24 +192,19 @@ def _fixed(frozen: UpdatedField, region: OccupancySampler, rays: Rays, ground: S
     return fixed
 
 
-def _held_out(count: int, every: int) -> Tensor:
-    """Which of the new photos' pixels are kept to judge by, (count,) bool: one of ``every``, always the same ones."""
-    drawn = torch.rand(count, generator=torch.Generator().manual_seed(0))
-    return drawn * max(every, 2) < 1  # something has to be left to learn from
-
-
 def _textured(
-    known: _Known, ground: Sequence[Foothold], sight: Sight, config: UpdateConfig, pixel: float
+    known: _Known, ground: Sequence[Foothold], sight: Sight, reach: float, pixel: float
 ) -> tuple[TexturedPlane, ...]:
     """The texture of the ground that objects stood on, and of what is beside these places and the new ones."""
     if not ground:
         return ()
-    cut, sparse = known.cut, known.sparse
+    cut = known.cut
     places = [o.grid for o in cut.to_learn.objects] + [m.grid.moved(m.new_from_old) for m in cut.moves]
-    around = Region(tuple(g.dilated(config.ground) for g in places) + cut.earlier.unknown.grids)
+    around = Region(tuple(g.dilated(reach) for g in places) + cut.earlier.unknown.grids)
     arrived = tuple(g for o in cut.change.objects if (g := o.grid_now) is not None)
-    taught = sparse[(~_held_out(len(sparse), config.held_out)).nonzero()[:, 0]]
-    return textured_planes(ground, around, cut, sight.dark, Region(arrived + cut.bare.grids), taught, pixel)
+    return textured_planes(
+        ground, around, cut, sight.dark, Region(arrived + cut.bare.grids), known.sparse.taught, pixel
+    )
 
 
 def _in_reach(region: OccupancySampler, frames: tuple[Frame, ...]) -> OccupancySampler:
@@ -219,16 +214,16 @@ def _in_reach(region: OccupancySampler, frames: tuple[Frame, ...]) -> OccupancyS
     return replace(region, far=furthest / space.radius + 2)
 
 
-def _light(known: _Known) -> Relighting | None:
+def _light(known: _Known, draw: torch.Generator) -> Relighting | None:
     """The light on what is known, from the new photos' pixels that show it; each photo is a fold."""
-    change, sparse = known.cut.change, known.sparse
+    change, sparse = known.cut.change, known.sparse.taught
     box = Region(tuple(g for o in change.objects for g in (o.grid, o.grid_now) if g is not None)).box
     side = max(float((o.grid.tight_aabb().diff(dim=0)).max()) for o in change.objects)
     box = torch.stack([box[0] - 1.5 * side, box[1] + 1.5 * side])
     unknown = [c & ~r for c, r in zip(known.changed, known.recalled)]
     still = ~sparse.within(unknown)  # up to the objects' very edges, where their shadows are darkest
     may = (still & crosses(sparse.rays, [box])).nonzero()[:, 0]
-    seen = sparse[_some(may, _LIT_RAYS)]
+    seen = sparse[_some(may, _LIT_RAYS, draw)]
     was = render_many(known.cut, seen.rays)
     x = seen.rays.origins + seen.rays.directions * was.depth[:, None]
     solid = (was.opacity > 0.9).nonzero()[:, 0]
@@ -241,7 +236,9 @@ def _pixel(change: SceneChange, x: Tensor) -> float:
     return min(float((f.centre.float() - x).norm()) / f.camera.fx for f in change.frames)
 
 
-def _shading(sparse: Lessons, cut: UpdatedField, change: SceneChange) -> tuple[Relighting | None, ...]:
+def _shading(
+    sparse: Lessons, cut: UpdatedField, change: SceneChange, draw: torch.Generator
+) -> tuple[Relighting | None, ...]:
     """How each moved object's own look changed with its place, kept at its old one.
 
     A side of it is often in one photo only, so patches of a photo are the folds, not photos.
@@ -249,7 +246,7 @@ def _shading(sparse: Lessons, cut: UpdatedField, change: SceneChange) -> tuple[R
     out: list[Relighting | None] = []
     for i, move in enumerate(cut.moves):
         near = meets(Region((move.grid.moved(move.new_from_old),)).sampler(cut.sampler.step), sparse.rays)
-        seen = sparse[_some(near.nonzero()[:, 0], _LIT_RAYS)]
+        seen = sparse[_some(near.nonzero()[:, 0], _LIT_RAYS, draw)]
         now = render_many(cut, seen.rays)
         x = seen.rays.origins + seen.rays.directions * now.depth[:, None]
         asked = transform(move.old_from_new, x)
@@ -264,7 +261,12 @@ def _shading(sparse: Lessons, cut: UpdatedField, change: SceneChange) -> tuple[R
 
 
 def _old_lessons(
-    capture: Capture, cut: UpdatedField, region: OccupancySampler, config: UpdateConfig, light: Relighting | None
+    capture: Capture,
+    cut: UpdatedField,
+    region: OccupancySampler,
+    config: UpdateConfig,
+    light: Relighting | None,
+    draw: torch.Generator,
 ) -> Lessons:
     """Ring pixels of the old photos whose rays meet the region, in the new light."""
     asked = _asked(capture.train)
@@ -274,19 +276,21 @@ def _old_lessons(
         ring = old_ring(places, i, capture.train[i], config.shadow, config.far)
         if ring is not None:
             chosen.append(ring.reshape(-1).nonzero()[:, 0] + bank.starts[k])
-    pixels = _some(torch.cat(chosen) if chosen else torch.zeros(0, dtype=torch.long), _RING_ASKED)
+    pixels = _some(torch.cat(chosen) if chosen else torch.zeros(0, dtype=torch.long), _RING_ASKED, draw)
     pixels = pixels[meets(region, bank.rays(pixels)).nonzero()[:, 0]]
-    pixels = _some(pixels, _RING_RAYS)
+    pixels = _some(pixels, _RING_RAYS, draw)
     rays, rgb = bank.rays(pixels), bank.colours(pixels)
     if light is not None:
         was = render_many(cut.pretrained, rays)
         rgb = light.applied(rays.origins + rays.directions * was.depth[:, None], rgb)
-    return Lessons(rays, rgb, torch.full((len(rgb),), -1), bank.place_of(pixels))
+    return Lessons(
+        rays, rgb, torch.full_like(pixels, -1), bank.place_of(pixels), torch.zeros(len(pixels), dtype=torch.bool)
+    )
 
 
-def _some(rows: Tensor, most: int) -> Tensor:
+def _some(rows: Tensor, most: int, draw: torch.Generator) -> Tensor:
     """``most`` of the rows (K,) at random, in order; all, if there are no more."""
-    return rows if len(rows) <= most else rows[torch.randperm(len(rows))[:most].sort().values]
+    return rows if len(rows) <= most else rows[torch.randperm(len(rows), generator=draw)[:most].sort().values]
 
 
 def _beside(region: Region) -> list[Tensor]:
@@ -294,7 +298,9 @@ def _beside(region: Region) -> list[Tensor]:
     return [torch.stack([2 * b[0] - b[1], 2 * b[1] - b[0]]) for b in region.boxes]
 
 
-def _ground(known: _Known, old: Lessons, wide: Region, eyes: Tensor, resolved: float) -> list[Foothold]:
+def _ground(
+    known: _Known, old: Lessons, wide: Region, eyes: Tensor, resolved: float, draw: torch.Generator
+) -> list[Foothold]:
     """What stood on planes where something is to be learnt: the objects that left, and what is left to learn of places
     that earlier visits know. The planes are looked for along the rays of the old photos that teach, else along those of
     the new ones that pass nearby."""
@@ -302,9 +308,9 @@ def _ground(known: _Known, old: Lessons, wide: Region, eyes: Tensor, resolved: f
     if len(rays) == 0:
         near = crosses(known.sparse.rays, _beside(wide))
         shown, rays = cut, known.sparse.rays[near.nonzero()[:, 0]]
-    rays = rays[torch.randperm(len(rays))[:_GROUND_RAYS]]
+    rays = rays[torch.randperm(len(rays), generator=draw)[:_GROUND_RAYS]]
     points = rays.origins + rays.directions * render_many(shown, rays).depth[:, None]
-    planes = planes_around(points, wide.box, eyes, resolved)
+    planes = planes_around(points, wide.box, eyes, resolved, draw)
     return footholds(
         [o.grid for o in cut.to_learn.objects if o.kind != "added"] + list(cut.earlier.unknown.grids), planes
     )
