@@ -14,6 +14,8 @@ import torch
 from refield.scene.files import write_json
 from refield.scene.images import write_image
 from refield.update.config import UpdateConfig
+from refield.update.fit_helper import HelperConfig
+from refield.update.relight import RelightConfig
 from refield.update.train import update_field
 from tests.baselines.test_baselines import capture, change, old
 from tests.captures import write_capture
@@ -116,7 +118,7 @@ def test_what_was_found_is_shown(
 ) -> None:
     script, cases = tables("paper_tables"), tables("tables.cases")
     mine, docs = folder(tmp_path / "mine"), tmp_path / "docs" / "results.md"
-    results(tmp_path / "out" / f"steps_{script.FitConfig.steps}_{script.UpdateConfig.steps}", "mine")
+    results(tmp_path / "out" / f"steps_{script.FitConfig.steps}_{script.HelperConfig.steps}", "mine")
     monkeypatch.setattr(cases.Case, "frames", write_capture(tmp_path / "new", 2).frames)
     docs.parent.mkdir()
     docs.write_text("# Results\n\nOther figures.\n")
@@ -154,7 +156,8 @@ def test_a_watched_update_is_the_same_update(
     tables: Callable[[str], Any], capture: Any, change: Any, old: Any, tmp_path: Path
 ) -> None:
     watched = tables("tables.watched")
-    config = UpdateConfig(steps=10, check_every=5, samples=1024, relight=False)
+    unlit, few = RelightConfig(still=False, moved=False), HelperConfig(steps=10, check_every=5, samples=1024)
+    config = UpdateConfig(relight=unlit, fit=few)
     seen: list[int] = []
 
     def score(field: Any) -> dict[str, float | None]:

@@ -17,6 +17,7 @@ from refield.scene.images import frame_image, write_image
 from refield.update import supervision
 from refield.update.supervision import (
     Places,
+    SuperviseConfig,
     changed_pixels,
     exposure,
     new_lessons,
@@ -104,10 +105,12 @@ def test_of_a_large_photo_some_pixels_teach(tmp_path: Path, monkeypatch: pytest.
     masks = [np.zeros((camera.height, camera.width), bool) for _ in frames]
     masks[1][:, 10:20] = True
     draw = torch.Generator().manual_seed(0)
-    lessons = new_lessons(frames, BallWorld((BALL,)), masks, 20, draw)
+    lessons = new_lessons(frames, BallWorld((BALL,)), masks, SuperviseConfig(), draw)
     assert [int((lessons.photo == i).sum()) for i in range(2)] == [500, 500]
     small = write_capture(tmp_path / "small", 1, camera.scaled(16, 12)).frames
-    mixed = new_lessons((*frames, *small), BallWorld((BALL,)), [*masks, np.zeros((12, 16), bool)], 20, draw)
+    mixed = new_lessons(
+        (*frames, *small), BallWorld((BALL,)), [*masks, np.zeros((12, 16), bool)], SuperviseConfig(), draw
+    )
     assert [int((mixed.photo == i).sum()) for i in range(3)] == [500, 500, 16 * 12], "each on its own"
     u = lessons.place % camera.width
     assert torch.equal(lessons.within(masks), (lessons.photo == 1) & (u >= 10) & (u < 20))
@@ -129,7 +132,7 @@ def test_pixels_kept_to_judge_by_teach_nothing_of_the_exposure(tmp_path: Path) -
 
     def told() -> supervision.Lessons:
         masks = [np.zeros((f.camera.height, f.camera.width), bool) for f in frames]
-        return new_lessons(frames, world, masks, 3, torch.Generator().manual_seed(0))
+        return new_lessons(frames, world, masks, SuperviseConfig(held_out=3), torch.Generator().manual_seed(0))
 
     first = told()
     assert 0.25 < float(first.held.float().mean()) < 0.42

@@ -9,8 +9,7 @@ from refield.field.radiance import Field, HashField, HashFieldConfig
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays
 from refield.update.composite import Origin, UpdatedField
-from refield.update.config import UpdateConfig
-from refield.update.fit_helper import HelperTraining, Lit
+from refield.update.fit_helper import HelperConfig, HelperTraining, Lit
 from refield.update.frozen import Segments
 from refield.update.recall import without
 from refield.update.region import move_out
@@ -85,6 +84,6 @@ def test_a_helper_is_told_what_was_looked_through() -> None:
     )
     sight = sight_of(frozen.pretrained, frames(), [BOX])
     x = torch.tensor([[0.7, 0.0, 0.0], [0.0, 0.0, 0.48]])  # beside the ball; at its surface
-    for known, tolls in ((sight, [UpdateConfig.emptiness, 0.0]), (None, [0.0, 0.0])):
-        run = HelperTraining(helper, frozen, nothing, nothing, nothing, UpdateConfig(), torch.Generator(), (), known)
+    for known, tolls in ((sight, [HelperConfig.emptiness, 0.0]), (None, [0.0, 0.0])):
+        run = HelperTraining(helper, frozen, nothing, nothing, nothing, HelperConfig(), torch.Generator(), (), known)
         assert run.misplaced[helper.sampler.cells(x)].tolist() == pytest.approx(tolls)

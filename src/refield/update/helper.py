@@ -27,17 +27,21 @@ _BESIDE = 1.5  # cells of the old field; so far around an object that left its f
 _BAND = 2.5  # cells above and beneath what an object stood on over which it becomes so empty
 
 
-def new_helper(region: OccupancySampler, frames: tuple[Frame, ...], seed: int) -> HashField:
+def new_helper(
+    region: OccupancySampler, frames: tuple[Frame, ...], seed: int, *, directions: bool = False
+) -> HashField:
     """A fresh helper that looks everywhere in ``region``; its finest cells are 1.5 pixels of the nearest photo.
 
-    Its colours do not depend on direction: what a few photos say about that does not hold between them.
+    Its colours do not depend on the direction unless ``directions``: what a few photos say about that does not hold
+    between them.
     """
     space = region.contraction
     pixel = min(float((f.centre.float() - space.centre).norm()) / max(f.camera.fx, f.camera.fy) for f in frames)
     finest = int(min(max(4 * space.radius / (1.5 * pixel), 64), 2048))
     helper = HashField(HashFieldConfig(levels=8, coarsest=16, finest=finest, log2_table=15), region, seed)
-    with torch.no_grad():
-        without_directions(helper, [helper.encoding.tables, *helper.networks])
+    if not directions:
+        with torch.no_grad():
+            without_directions(helper, [helper.encoding.tables, *helper.networks])
     return helper
 
 

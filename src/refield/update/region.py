@@ -40,6 +40,11 @@ class Region:
         boxes = torch.stack(self.boxes)
         return torch.stack([boxes[:, 0].amin(0), boxes[:, 1].amax(0)])
 
+    @property
+    def around(self) -> list[Tensor]:
+        """World boxes (2, 3) three times as large as its own."""
+        return [torch.stack([2 * b[0] - b[1], 2 * b[1] - b[0]]) for b in self.boxes]
+
     def contains(self, x: Tensor) -> Tensor:
         """Whether world points (..., 3) are in its grids, (...,) bool."""
         flat = x.detach().reshape(-1, 3)

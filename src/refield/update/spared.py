@@ -26,6 +26,14 @@ _ROUNDED = 1 / 255**2 / 12  # squared error of a photo's own rounding to 8 bits;
 
 
 @dataclass(frozen=True)
+class ShowConfig:
+    """What is kept of what was learnt."""
+
+    spared: bool = True
+    """leave out parts that show unchanged pixels worse than the old field did"""
+
+
+@dataclass(frozen=True)
 class LeftOut:
     """A part that an update is better without."""
 

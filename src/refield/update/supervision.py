@@ -17,13 +17,34 @@ from torch import Tensor
 from refield.field.pixels import PixelBank
 from refield.field.radiance import Field
 from refield.field.render import render_many
+from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid, SceneChange
+from refield.update.light import Relighting
+from refield.update.region import meets
 from refield.vision.pixels import dilate, enlarged, fit_colours
 
 _UNTOUCHED_MARGIN = 0.03  # of the width: changed areas grow by this before colours are compared across visits
 _PIXELS = 1 << 18  # of a photo; more add time and nothing to learn
 _EXPOSURE_PIXELS = 4000  # a photo: enough for six numbers
+_BETTER = 1.2, 1e-3  # an exposure is believed that makes the median error so many times less, and so much (of 1) less
+_MADE = 20  # of the old photos that an earlier visit put out of date; each takes longer to put right than to learn from
+_RING_ASKED = 1 << 20  # of the old photos' pixels, whether their rays meet the region
+_RING_RAYS = 40_000  # of the old photos; more add time and nothing to learn
+
+
+@dataclass(frozen=True)
+class SuperviseConfig:
+    """Which pixels teach."""
+
+    shadow: float = 0.01
+    """Old photos: pixels this near to an object's mask, in image widths, may hold its shadow."""  # §10.1.3
+    far: float = 0.15
+    """Old photos: pixels further away than this, in image widths, do not teach."""  # §10.1.3
+    held_out: int = 20
+    """every so-many-th pixel of the new photos is kept to judge by: nothing is fitted to it"""
+    exposure: bool = True
+    """bring the new photos to the old ones' exposure; the paper's helper has an appearance embedding"""
 
 
 @dataclass(frozen=True)
@@ -162,19 +183,25 @@ def changed_pixels(change: SceneChange, places: Places, index: int, frame: Frame
 
 
 def new_lessons(
-    frames: Sequence[Frame], field: Field, changed: Sequence[np.ndarray], held_out: int, draw: torch.Generator
+    frames: Sequence[Frame],
+    field: Field,
+    changed: Sequence[np.ndarray],
+    config: SuperviseConfig,
+    draw: torch.Generator,
 ) -> Lessons:
-    """The new photos' pixels, in the old photos' exposure; of large photos some of them. One of ``held_out`` is drawn
-    to judge by, once for all that follows.
+    """The new photos' pixels, in the old photos' exposure; of large photos some of them. Which are kept to judge
+    by is drawn here, once for all that follows.
 
     ``field`` is the old one with the objects cut out and moved, ``changed`` each photo's `changed_pixels`.
     """
     bank = PixelBank(frames, masks=[_thinned(f) for f in frames])
     everything = torch.arange(len(bank))
-    held = torch.rand(len(bank), generator=draw) * max(held_out, 2) < 1  # something has to be left to learn from
+    held = torch.rand(len(bank), generator=draw) * max(config.held_out, 2) < 1  # something has to be left to learn from
     out = Lessons(
         bank.rays(everything), bank.colours(everything), bank.frame_of(everything), bank.place_of(everything), held
     )
+    if not config.exposure:
+        return out
     wide = [dilate(mask, math.ceil(_UNTOUCHED_MARGIN * mask.shape[1])) for mask in changed]
     told = ~out.within(wide) & ~held
     for i in range(len(frames)):
@@ -205,5 +232,49 @@ def exposure(photo: Tensor, rendered: Tensor) -> Tensor:
     affine = torch.from_numpy(fit_colours(photo[None].numpy(), rendered[None].numpy())).float()
     before = (photo - rendered).abs().median()
     after = (photo * affine[0] + affine[1] - rendered).abs().median()
-    worth = before > 1.2 * after + 1e-3
+    worth = before > _BETTER[0] * after + _BETTER[1]
     return affine if bool(worth) else torch.tensor([[1.0] * 3, [0.0] * 3])
+
+
+def old_lessons(
+    frames: Sequence[Frame],
+    places: Places,
+    field: Field,
+    region: OccupancySampler,
+    config: SuperviseConfig,
+    light: Relighting | None,
+    draw: torch.Generator,
+) -> Lessons:
+    """Ring pixels of the old photos whose rays meet the region, in the new light; ``field`` is the old one."""
+    asked = _asked(frames)
+    bank = PixelBank([frames[i] for i in asked])
+    chosen = [torch.zeros(0, dtype=torch.long)]
+    for k, i in enumerate(asked):
+        ring = old_ring(places, i, frames[i], config.shadow, config.far)
+        if ring is not None:
+            chosen.append(ring.reshape(-1).nonzero()[:, 0] + bank.starts[k])
+    pixels = at_most(torch.cat(chosen), _RING_ASKED, draw)
+    pixels = at_most(pixels[meets(region, bank.rays(pixels)).nonzero()[:, 0]], _RING_RAYS, draw)
+    rays, rgb = bank.rays(pixels), bank.colours(pixels)
+    if light is not None:
+        was = render_many(field, rays)
+        rgb = light.applied(rays.origins + rays.directions * was.depth[:, None], rgb)
+    nothing = torch.zeros(len(pixels), dtype=torch.bool)
+    return Lessons(rays, rgb, torch.full_like(pixels, -1), bank.place_of(pixels), held=nothing)
+
+
+def _asked(frames: Sequence[Frame]) -> list[int]:
+    """Indices of the old photos that teach: all of them, but only some of those that have yet to be made."""
+    made = [i for i, f in enumerate(frames) if f.made is None]
+    unmade = [i for i, f in enumerate(frames) if f.made is not None]
+    return sorted(made + unmade[:: -(-len(unmade) // _MADE) or 1])
+
+
+def at_most_of(lessons: Lessons, which: Tensor, most: int, draw: torch.Generator) -> Lessons:
+    """Those of the pixels that ``which`` (N,) bool says, ``most`` of them at random if there are more."""
+    return lessons[at_most(which.nonzero()[:, 0], most, draw)]
+
+
+def at_most(rows: Tensor, most: int, draw: torch.Generator) -> Tensor:
+    """``most`` of the rows (K,) at random, in order; all, if there are no more."""
+    return rows if len(rows) <= most else rows[torch.randperm(len(rows), generator=draw)[:most].sort().values]
