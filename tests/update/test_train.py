@@ -18,7 +18,7 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.images import write_image
-from refield.update import fit_textured, relight, train
+from refield.update import fit_textured, relight, supervision, train
 from refield.update.config import UpdateConfig
 from refield.update.cut import CutConfig
 from refield.update.fit_helper import HelperConfig, HelperTraining, Lit
@@ -229,7 +229,8 @@ def test_light_stays_where_no_photo_shows_what_left(
     capture, change = case
     light = Relighting(torch.tensor([[-2.0, -2, -2], [2, 2, 2]]), torch.zeros(3, 3, 3, 3))
     monkeypatch.setattr(relight, "fit_light", lambda *given: light)
-    monkeypatch.setattr(train, "meets", lambda sampler, rays: torch.zeros(len(rays), dtype=torch.bool))
+    for room in (train, supervision):
+        monkeypatch.setattr(room, "meets", lambda sampler, rays: torch.zeros(len(rays), dtype=torch.bool))
     updated = update_field(capture, OLD_FIELD, change, QUICK)
     assert updated.light is light and updated.shading[0] is light and updated.helper is None
     assert "nothing could be learnt" in updated.why_stopped

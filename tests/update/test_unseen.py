@@ -8,9 +8,10 @@ import torch
 from refield.field.radiance import Field, HashField, HashFieldConfig
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays
-from refield.update.composite import Origin, UpdatedField
+from refield.update.composite import UpdatedField
 from refield.update.fit_helper import HelperConfig, HelperTraining, Lit
 from refield.update.frozen import Segments
+from refield.update.learnt import Learnt, Origin
 from refield.update.recall import without
 from refield.update.region import move_out
 from refield.update.supervision import Lessons
@@ -57,7 +58,7 @@ def test_hidden_cells_are_not_shown_unless_something_new_answers_for_them() -> N
     cells = sight_of(field, frames(), [BOX]).hidden
     x = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.2]])
     change = change_of(moved(Ball(at(0.0, 0.0, 0.0), 0.1), at(2.0, 0.0, 0.0)))
-    updated = UpdatedField(field, change, helper=BallWorld((Ball(at(0.0, 0.0, 0.0), 0.1),), floor=False))
+    updated = UpdatedField(field, change, Learnt(BallWorld((Ball(at(0.0, 0.0, 0.0), 0.1),), floor=False)))
     assert updated.sampler.occupied(x).all()
     shown = updated.unshown(cells).sampler.occupied(x)
     assert shown.tolist() == [True, False] and updated.sampler.occupied(x).all()
@@ -74,7 +75,7 @@ def test_hidden_cells_are_not_shown_unless_something_new_answers_for_them() -> N
 def test_a_helper_is_told_what_was_looked_through() -> None:
     change = change_of(moved(SHELL, at(2.0, 0.0, 0.0)))
     wide = move_out(change, 1.5)
-    frozen = UpdatedField(BallWorld((SHELL,), floor=False), change, region=wide)
+    frozen = UpdatedField(BallWorld((SHELL,), floor=False), change, Learnt(region=wide))
     helper = HashField(HashFieldConfig(2, 8, 16, 8, 8, 3), wide.sampler(0.05))
     zeros = torch.zeros
     rays = Rays(zeros(0, 3), zeros(0, 3))

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,7 +30,15 @@ from refield.scene.change import OccupancyGrid, SceneChange
 from refield.scene.inside import in_boxes, spans
 from refield.scene.notebook import SIDE, drawn, facts, strip
 from refield.scene.pose import rotate, transform
-from refield.update.light import Relighting
+from refield.update.learnt import (
+    NOTHING_EARLIER,
+    NOTHING_LEARNT,
+    NOTHING_TAKEN,
+    NOWHERE,
+    Earlier,
+    Learnt,
+    TakenBack,
+)
 from refield.update.region import Region, carved, finer, grown, move_out
 from refield.update.textured import TexturedPlane
 from refield.update.view import View, boxes_around, lights_of
@@ -44,38 +51,6 @@ SKIN = 1.5
 SKIN_VACATED = 1.0
 """the same where something left that was solid"""
 
-NOWHERE = Region(())
-
-
-@dataclass(frozen=True)
-class Origin:
-    """Where an object of a change comes from: object ``index`` of the change that is ``layer`` updates before this."""
-
-    object: int
-    layer: int
-    index: int
-
-
-@dataclass(frozen=True)
-class Earlier:
-    """What an update takes from earlier visits in place of learning it."""
-
-    undone: tuple[Origin, ...] = ()
-    """Objects that are back where the field without that earlier change shows them; it is the one wrapped"""
-    left: tuple[Origin, ...] = ()
-    """Objects that left a place to which that earlier change had brought them"""
-    places: Region = NOWHERE
-    """these places, widely"""
-    ground: Field | None = None
-    """shows them without the objects"""
-    unknown: Region = NOWHERE
-    """parts of these places that even so nobody has seen: an object's old place and its new one overlapped"""
-
-    def __bool__(self) -> bool:
-        return bool(self.undone or self.left)
-
-
-NOTHING_EARLIER = Earlier()
 _DEPTH = 10.0  # optical depth of a sample of what changed that lies in a textured plane
 _SOLID = 0.05  # opacity of a sample that was not empty before
 _LAYER = 10  # nodes of a grid that make a layer
@@ -91,42 +66,34 @@ class UpdatedField:
         self,
         pretrained: Field,
         change: SceneChange,
-        helper: Field | None = None,
+        learnt: Learnt = NOTHING_LEARNT,
         *,
-        region: Region | None = None,
-        light: Relighting | None = None,
-        shading: tuple[Relighting | None, ...] = (),
         eyes: Tensor | None = None,
-        bare: Region = NOWHERE,
-        sampler: OccupancySampler | None = None,
         earlier: Earlier = NOTHING_EARLIER,
-        skipped: frozenset[int] = frozenset(),
-        untaught: Region = NOWHERE,
+        taken: TakenBack = NOTHING_TAKEN,
+        sampler: OccupancySampler | None = None,
     ) -> None:
         """What a visit adds to the old field.
 
-        ``region`` is where the helper speaks (M_out of the change by default); with no helper it is cut out (the
-        objects' own grids and their skin by default). ``light`` changes what stood still, ``shading`` each moved
-        object, at its old place. ``eyes`` (C, 3) are the centres of the old cameras: moved objects are not asked
-        along directions that none of them looked along. ``bare``, a part of the region, goes before what moved in.
-        ``sampler`` is recomputed where things changed unless it is given. ``earlier`` says what earlier visits know;
-        the change's objects that it names as undone, and those in ``skipped``, are as the old field shows them.
-        ``untaught`` is where something stood while the helper learnt: the old field knows better what is under it.
+        Args:
+            learnt: from the new photos.
+            eyes: (C, 3) centres of the old cameras: moved objects are not asked along directions that none of them
+                looked along.
+            earlier: what earlier visits know; objects of the change that it names as undone are as the old field shows
+                them.
+            taken: what later visits took back.
+            sampler: where to look; found anew where things changed unless it is given.
         """
-        self.untaught = untaught
-        self._was = carved(change, SKIN * pretrained.sampler.step) if untaught.grids else NOWHERE
-        self.earlier, self.skipped = earlier, skipped | {origin.object for origin in earlier.undone}
-        self.pretrained, self.change, self.helper, self.light = pretrained, change, helper, light
-        self.shading, self.eyes, self.bare = shading, eyes, bare
+        self.pretrained, self.change, self.eyes = pretrained, change, eyes
+        self.earlier, self.taken = earlier, taken
+        self.skipped, self.untaught = taken.skipped | {origin.object for origin in earlier.undone}, taken.untaught
+        self._was = carved(change, SKIN * pretrained.sampler.step) if self.untaught.grids else NOWHERE
+        self.helper, self.light, self.shading, self.bare = learnt.helper, learnt.light, learnt.shading, learnt.bare
         self.why_stopped = ""
         """what ended the helper's training, in words; empty if it was not trained here"""
         self.notes: tuple[str, ...] = ()
         """what was left out when it was trained, and what it costs, in words"""
-        if region is None:
-            rest = self.to_learn
-            region = carved(rest, SKIN * pretrained.sampler.step) if helper is None else move_out(rest, DILATION)
-            region = Region(region.grids + earlier.unknown.grids)
-        self.region = region
+        self.region = region = self._usual_region() if learnt.region is None else learnt.region
         self.sampler_step = pretrained.sampler.step
         self.moves: tuple[Move, ...] = moves_of(_part(change, self.skipped))
         self._shells, self._inner_shells = (
@@ -160,6 +127,16 @@ class UpdatedField:
         self._changed_of: tuple[Tensor, tuple[OccupancySampler, tuple[Tensor, ...]]] | None = None
         self._marched: tuple[Tensor, ...] = tuple(_by_cells(self.sampler, b) for b in self.boxes) + before
 
+    def _usual_region(self) -> Region:
+        rest, step = self.to_learn, self.pretrained.sampler.step
+        region = carved(rest, SKIN * step) if self.helper is None else move_out(rest, DILATION)
+        return Region(region.grids + self.earlier.unknown.grids)
+
+    @property
+    def learnt(self) -> Learnt:
+        """What its visit learnt, the region found."""
+        return Learnt(self.helper, self.region, self.light, self.shading, self.bare)
+
     def __repr__(self) -> str:
         return f"UpdatedField({self._changed_here}; before: {self.pretrained!r})"
 
@@ -192,19 +169,23 @@ class UpdatedField:
         out.sampler = out._without_unseen(self.sampler)
         return out
 
-    def but(self, **parts: Any) -> UpdatedField:
-        """The same update with other ``region``, ``light`` or ``shading``, as of the constructor."""
-        kept = {"region": self.region, "light": self.light, "shading": self.shading} | parts
+    def but(
+        self,
+        *,
+        pretrained: Field | None = None,
+        change: SceneChange | None = None,
+        learnt: Learnt | None = None,
+        earlier: Earlier | None = None,
+        taken: TakenBack | None = None,
+    ) -> UpdatedField:
+        """The same update with other parts, as of the constructor; where to look is found anew."""
         out = UpdatedField(
-            self.pretrained,
-            self.change,
-            self.helper,
-            **kept,
+            pretrained or self.pretrained,
+            change or self.change,
+            learnt or self.learnt,
             eyes=self.eyes,
-            bare=self.bare,
-            earlier=self.earlier,
-            skipped=self.skipped,
-            untaught=self.untaught,
+            earlier=self.earlier if earlier is None else earlier,
+            taken=taken or self.taken,
         ).unshown(self.unseen)
         out.why_stopped = self.why_stopped
         return out

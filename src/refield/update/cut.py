@@ -12,8 +12,9 @@ from refield.field.radiance import Field
 from refield.scene.capture import Capture, centres
 from refield.scene.change import SceneChange
 from refield.update.bare import bare_skin
-from refield.update.composite import NOTHING_EARLIER, UpdatedField
+from refield.update.composite import UpdatedField
 from refield.update.evidence import as_remembered, recalled_pixels
+from refield.update.learnt import NOTHING_EARLIER, NOWHERE, Learnt
 from refield.update.recall import earlier_of
 from refield.update.region import Region
 from refield.update.supervision import Lessons, SuperviseConfig, changed_pixels, new_lessons, places_of
@@ -79,8 +80,8 @@ def known_of(
     if cut.earlier and not as_remembered(cut, sparse, changed, recalled, draw):
         cut = UpdatedField(field, change, eyes=eyes)
         recalled = tuple(np.zeros_like(r) for r in recalled)
-    bare = bare_skin(cut, capture.train, change) if config.bare else Region(())
+    bare = bare_skin(cut, capture.train, change) if config.bare else NOWHERE
     if bare.grids:
         empty = Region(cut.region.grids + bare.grids)
-        cut = UpdatedField(cut.pretrained, change, region=empty, eyes=eyes, bare=bare, earlier=cut.earlier)
+        cut = cut.but(learnt=Learnt(region=empty, bare=bare))
     return Known(cut, sparse, changed, recalled)

@@ -98,11 +98,13 @@ def _parts(updated: UpdatedField) -> dict[str, _Without]:
     """What may be left out, by its name in words, and how."""
     out: dict[str, _Without] = {}
     if updated.light is not None:
-        out["the light on what stood still"] = lambda field: field.but(light=None)
+        out["the light on what stood still"] = lambda field: field.but(learnt=replace(field.learnt, light=None))
     if any(light is not None for light in updated.shading):
-        out["the light on what moved"] = lambda field: field.but(shading=())
+        out["the light on what moved"] = lambda field: field.but(learnt=replace(field.learnt, shading=()))
     if updated.helper is not None or updated.region.planes:
-        out["what is beside the objects' places"] = lambda field: field.but(region=_narrow(field))
+        out["what is beside the objects' places"] = lambda field: field.but(
+            learnt=replace(field.learnt, region=_narrow(field))
+        )
     return out
 
 

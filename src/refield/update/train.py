@@ -70,14 +70,11 @@ def update_field(
     say("light")
     light = light_of(known, draw) if config.relight.still else None
     shading = shading_of(known, draw) if config.relight.moved else ()
-    eyes, earlier = cut.eyes, cut.earlier
-    lit = partial(
-        UpdatedField, cut.pretrained, change, light=light, shading=shading, eyes=eyes, bare=cut.bare, earlier=earlier
-    )
-    unknown = move_out(cut.to_learn, config.cut.dilation).grids + earlier.unknown.grids
+    lit = replace(cut.learnt, light=light, shading=shading)
+    unknown = move_out(cut.to_learn, config.cut.dilation).grids + cut.earlier.unknown.grids
     wide = Region(unknown + cut.bare.grids)
     if not wide.grids:
-        return done(lit(region=wide), "earlier visits know all of it")
+        return done(cut.but(learnt=replace(lit, region=wide)), "earlier visits know all of it")
     say("supervise")
     middle = wide.box.mean(0)
     step, pixel = step_near(field, middle), known.pixel(middle)
@@ -89,7 +86,7 @@ def update_field(
         old = old_lessons(capture.train, places_of(change), cut.pretrained, near, config.supervise, light, draw)
     sparse = at_most_of(known.sparse, meets(near, known.sparse.rays), _NEW_RAYS, draw)
     if len(sparse) + len(old) == 0:
-        return done(lit(region=cut.region), "no photo shows any of it, so that nothing could be learnt")
+        return done(cut.but(learnt=lit), "no photo shows any of it, so that nothing could be learnt")
     seen_from = centres(capture.train).float()
     ground = ground_of(known, old, wide, seen_from, max(pixel, step), draw) if config.ground.footholds else []
     sight = (
@@ -99,7 +96,7 @@ def update_field(
     planes = textured_of(known, textured, sight.dark, config.ground.reach, pixel)
     say("freeze")
     told, region = Region(wide.grids, planes), finer(without_planes(near, planes))
-    frozen = lit(region=told).unshown(sight.hidden)
+    frozen = cut.but(learnt=replace(lit, region=told)).unshown(sight.hidden)
     if not region.grid.any():
         return done(frozen, "there is nothing but the ground to show")
     parts = (sparse.taught, old, sparse.judging)
@@ -110,7 +107,8 @@ def update_field(
     run.run(on_progress)
     say("show")
     helper.requires_grad_(False)
-    return done(lit(helper=helper, region=told).unshown(sight.hidden), run.why_stopped)
+    updated = cut.but(learnt=replace(lit, helper=helper, region=told)).unshown(sight.hidden)
+    return done(updated, run.why_stopped)
 
 
 def _done(updated: UpdatedField, why_stopped: str, *, known: Known, config: UpdateConfig) -> UpdatedField:
