@@ -118,7 +118,7 @@ def test_what_nobody_runs_is_found_to_be_so() -> None:
     run = reached()
     assert ("update.train", "update_field") in run  # a public name
     assert ("estimate.register", "register") in run  # called from far away
-    assert ("update.composite", "UpdatedField._route") in run  # a method, of something built elsewhere
+    assert ("update.routing", "Routing.of") in run  # a method, of something built elsewhere
     assert ("field.kernels.cpu.step", "train_step") in run  # a twin, chosen by device
     assert ("commands.undo", "run") in run
     assert ("field.warp", "two_way") in run  # by the paper's route alone

@@ -166,7 +166,7 @@ def test_leaving_out_what_is_hidden_leaves_the_picture() -> None:
     twice = UpdatedField(once, change_of(moved(NEW, at(0.0, 0.9, 0.3))))
     rays = views()
     for field in (once, twice):
-        few, every = field.samples(rays), interleaved(*(part(rays) for part in field._split))
+        few, every = field.samples(rays), interleaved(*(part(rays) for part in field._marching.split))
         assert len(few) < 0.8 * len(every)
         seen = [composite(*field(*s.positions(rays)), s).rgb for s in (few, every)]
         assert float((seen[0] - seen[1]).abs().max()) < 5e-3

@@ -57,7 +57,7 @@ def test_round_trip(tmp_path, helped, lit):
     d = torch.nn.functional.normalize(torch.randn(3000, 3), dim=-1)
     for ours, theirs in zip(field(x, d), back(x, d)):
         assert torch.equal(ours, theirs)
-    assert field._route(x).textured.numel() and torch.equal(back.region.planes[0].rgb, field.region.planes[0].rgb)
+    assert field.routing.of(x).textured.numel() and torch.equal(back.region.planes[0].rgb, field.region.planes[0].rgb)
     assert torch.equal(field.sampler.grid, back.sampler.grid) and torch.equal(field.unseen, back.unseen)
     rays = Rays(torch.tensor([[0.0, 0.0, -3.0]]).expand(200, 3), torch.nn.functional.normalize(-x[:200] + 3, dim=-1))
     assert torch.equal(render_rays(field, rays).rgb, render_rays(back, rays).rgb)

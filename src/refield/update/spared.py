@@ -16,8 +16,9 @@ from torch import Tensor
 
 from refield.field.radiance import Field
 from refield.field.render import render_many
-from refield.update.composite import SKIN, UpdatedField
+from refield.update.composite import UpdatedField
 from refield.update.region import Region, carved, grown
+from refield.update.routing import SKIN
 from refield.update.supervision import Lessons
 from refield.update.textured import TexturedPlane
 
