@@ -70,7 +70,7 @@ def test_an_update_from_python_is_that_of_the_command_line(place, monkeypatch, c
     believing(monkeypatch, "moved", "added")
     assert main(["update", "elsewhere/work", "new", "--evaluation", "new", *FEW, "--update.fit.check-every", "1"]) == 0
     scene, stages, looks = refield.open(place / "work"), [], []
-    config = replace(CONFIG, update=replace(CONFIG.update, check_every=1))
+    config = replace(CONFIG, update=replace(CONFIG.update, fit=replace(CONFIG.update.fit, check_every=1)))
     made = scene.update("new", config, evaluation="new", on_stage=stages.append, on_progress=looks.append)
     assert capsys.readouterr().err.count("load the field") == 1  # of the command; Python hears, and prints nothing
     here, there = contents(place / "work"), contents(place / "elsewhere/work")

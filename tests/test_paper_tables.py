@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ def tables(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Any]]:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     yield importlib.import_module
     for name in set(sys.modules) - before:
-        if name.split(".")[0] in ("tables", "estimate", "record", "change_score", "paper_tables"):
+        if name.split(".")[0] in ("tables", "estimate", "record", "change_score", "paper_tables", "departures"):
             del sys.modules[name]
 
 
@@ -185,3 +186,19 @@ def test_shown_from_another_height(tables: Callable[[str], Any], tmp_path: Path)
             assert torch.allclose(pose[:3, 2], toward / toward.norm(), atol=1e-9)
             up = float(torch.rad2deg(torch.asin(-toward[2] / toward.norm())))
             assert up == pytest.approx(elevation, abs=1e-6)
+
+
+def test_each_departure_is_switched_off_by_itself(tables: Callable[[str], Any]) -> None:
+    """And all of them together; where to look for what a switch does, each row's name says."""
+    script = tables("departures")
+
+    def choices(config: UpdateConfig) -> set[tuple[str, str, Any]]:
+        stages = {k: v for k, v in asdict(config).items() if isinstance(v, dict) and k != "paper"}
+        return {(stage, name, value) for stage, own in stages.items() for name, value in own.items()}
+
+    usual, together = choices(script.DEFAULT), choices(script.OFF["all of these"])
+    singles = {name: choices(config) - usual for name, config in script.OFF.items() if name != "all of these"}
+    for row, found in singles.items():
+        ((stage, name, _),) = found
+        assert row.startswith(f"{stage}.{name.replace('_', '-')}")
+    assert set.union(*singles.values()) == together - usual

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -19,6 +20,9 @@ from refield.update.ground import Foothold, rim
 from refield.update.region import Region, grown
 from refield.update.unseen import Sight
 
+_SHAPE = HashFieldConfig(levels=8, coarsest=16, log2_table=15)  # of a region, a small part of a scene
+_FINE = 1.5  # pixels of the nearest new photo, the side of a finest cell; so many of these along the space at least and
+_FINEST = 64, 2048  # at most
 _OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
 _PROBES = 4  # points of a cell that are asked for it
 _WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
@@ -37,8 +41,8 @@ def new_helper(
     """
     space = region.contraction
     pixel = min(float((f.centre.float() - space.centre).norm()) / max(f.camera.fx, f.camera.fy) for f in frames)
-    finest = int(min(max(4 * space.radius / (1.5 * pixel), 64), 2048))
-    helper = HashField(HashFieldConfig(levels=8, coarsest=16, finest=finest, log2_table=15), region, seed)
+    finest = int(min(max(4 * space.radius / (_FINE * pixel), _FINEST[0]), _FINEST[1]))
+    helper = HashField(replace(_SHAPE, finest=finest), region, seed)
     if not directions:
         with torch.no_grad():
             without_directions(helper, [helper.encoding.tables, *helper.networks])
