@@ -257,6 +257,7 @@ def _one_update(folder: Path, size: int, cameras: int, device: torch.device) -> 
     from refield.synthetic.worlds import WORLDS
     from refield.synthetic.write import true_change
     from refield.update.config import UpdateConfig
+    from refield.update.fit_helper import HelperConfig
     from refield.update.train import update_field
 
     world, tiny = WORLDS["table"](0), size <= 64
@@ -274,7 +275,7 @@ def _one_update(folder: Path, size: int, cameras: int, device: torch.device) -> 
     stages: list[tuple[str, float]] = []
     change = true_change(world, capture, frames)
     begin = time.perf_counter()
-    said = UpdateConfig(steps=2, relight=device.type == "cuda") if tiny else UpdateConfig()
+    said = UpdateConfig(fit=HelperConfig(steps=2)) if tiny else UpdateConfig()
     update_field(capture, model, change, said, lambda name: stages.append((name, time.perf_counter() - begin)))
     whole = time.perf_counter() - begin
     training = dict(stages).get("show", whole) - dict(stages).get("train", 0.0)

@@ -33,6 +33,7 @@ from refield.scene.errors import InputError
 from refield.scene.files import write_bytes
 from refield.synthetic.worlds import WORLDS
 from refield.update.config import UpdateConfig
+from refield.update.fit_helper import HelperConfig
 from refield.vision.perceptual import open_lpips
 from refield.vision.weights import WeightsError
 
@@ -81,7 +82,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--lpips", type=Path, help="a folder with weights for LPIPS, see docs/weights.md")
     parser.add_argument("--lama", type=Path, help="LaMa's ONNX file, see docs/weights.md")
     parser.add_argument("--steps", type=int, default=FitConfig.steps, help="of re-training and fine-tuning")
-    parser.add_argument("--update-steps", type=int, default=UpdateConfig.steps)
+    parser.add_argument("--update-steps", type=int, default=HelperConfig.steps)
     parser.add_argument("--looks", type=int, default=16, help="points of a curve")
     parser.add_argument("--threads", type=int, default=min(os.cpu_count() or 1, 2))
     parser.add_argument("--dry-run", action="store_true", help="say what is still to be run, and stop")
@@ -118,7 +119,8 @@ def _lab(options: argparse.Namespace) -> Lab:
     return Lab(
         Kept(options.out / f"steps_{options.steps}_{options.update_steps}"),  # never mixed with others
         FitConfig(steps=options.steps),
-        UpdateConfig(steps=options.update_steps, max_seconds=600.0),  # a busy machine must not change what is found
+        # a busy machine must not change what is found
+        UpdateConfig(fit=HelperConfig(steps=options.update_steps, max_seconds=600.0)),
         None if options.lpips is None else open_lpips(options.lpips),
         None if options.lama is None else Lama(options.lama),
         options.looks,

@@ -136,7 +136,14 @@ def believing(monkeypatch, *kinds):
     monkeypatch.setattr(make, "estimate_change", estimate)
 
 
-FEW = ["--update.steps", "2", "--update.samples", "512", "--update.no-relight"]
+FEW = [
+    "--update.fit.steps",
+    "2",
+    "--update.fit.samples",
+    "512",
+    "--update.relight.no-still",
+    "--update.relight.no-moved",
+]
 
 
 def test_nothing_changed_writes_only_the_report(place, monkeypatch, capsys):

@@ -85,9 +85,9 @@ def test_the_full_help_names_what_is_accepted_and_nothing_else(command, monkeypa
 
 def test_what_the_short_help_hides_is_accepted_as_before():
     asked = parsed(
-        kind_of("update"), ["w", "p", "--estimate.paper.detect.align.inliers", "7", "--update.far", "2"], "u"
+        kind_of("update"), ["w", "p", "--estimate.paper.detect.align.inliers", "7", "--update.supervise.far", "2"], "u"
     )
-    assert asked.estimate.paper.detect.align.inliers == 7 and asked.update.far == 2
+    assert asked.estimate.paper.detect.align.inliers == 7 and asked.update.supervise.far == 2
     asked = parsed(kind_of("train"), ["d", "--nerfacto.field.proposals.1.levels", "3", "--fit.photos.no-poses"], "t")
     assert asked.nerfacto.field.proposals[1].levels == 3 and not asked.fit.photos.poses
 

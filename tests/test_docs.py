@@ -19,7 +19,7 @@ from refield.field.fit import FitConfig
 from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig
 from refield.update.config import UpdateConfig
 from refield.update.paper.config import PaperUpdateConfig, reduced
-from refield.update.train import _RING_RAYS
+from refield.update.supervision import _RING_RAYS
 from tests.reach import reached
 
 ROOT = Path(__file__).parent.parent
@@ -95,11 +95,13 @@ def test_what_the_method_names_is_run_by_someone() -> None:
 def test_numbers_of_the_method_are_those_that_are_used() -> None:
     told = (ROOT / "docs/method.md").read_text(encoding="utf-8")
     update, fit = UpdateConfig(), NerfactoFitConfig()
-    assert f"box {update.dilation:g} times as large (`--update.dilation`)" in told
-    assert update.ground == 2 and "within twice its size (`--update.ground`)" in told
-    assert update.sparse_share == 0.5 and "half of the rays from the new photos (`--update.sparse-share`)" in told
-    assert f"{update.steps} steps at most" in told
-    assert f"the paper's {update.shadow:g} and {update.far:g} of the width" in told
+    assert f"box {update.cut.dilation:g} times as large (`--update.cut.dilation`)" in told
+    assert update.ground.reach == 2 and "within twice its size (`--update.ground.reach`)" in told
+    assert (
+        update.fit.sparse_share == 0.5 and "half of the rays from the new photos (`--update.fit.sparse-share`)" in told
+    )
+    assert f"{update.fit.steps} steps at most" in told
+    assert f"the paper's {update.supervise.shadow:g} and {update.supervise.far:g} of the width" in told
     assert f"of what they leave {_RING_RAYS // 1000} 000 rays" in told
     paper, small = PaperUpdateConfig(), reduced(PaperUpdateConfig())
     assert paper.dilation == 2 and "the box twice as large (`--update.paper.dilation`)" in told
@@ -108,7 +110,7 @@ def test_numbers_of_the_method_are_those_that_are_used() -> None:
     assert f"{small.steps} steps of {small.rays} rays for the update" in told
     assert f"({fit.steps // 1000} 000 steps of {fit.rays} rays)" in told
     assert f"{REDUCED.steps} steps of {REDUCED.rays} rays" in told
-    weights = {FitConfig().distortion, update.distortion}
+    weights = {FitConfig().distortion, update.fit.distortion}
     assert weights == {0.01} and f"is 0.01 for our field and the helper, nerfstudio's {fit.distortion:g}" in told
 
 
@@ -116,7 +118,7 @@ def test_what_nobody_runs_is_found_to_be_so() -> None:
     run = reached()
     assert ("update.train", "update_field") in run  # a public name
     assert ("estimate.register", "register") in run  # called from far away
-    assert ("update.composite", "UpdatedField._route") in run  # a method, of something built elsewhere
+    assert ("update.routing", "Routing.of") in run  # a method, of something built elsewhere
     assert ("field.kernels.cpu.step", "train_step") in run  # a twin, chosen by device
     assert ("commands.undo", "run") in run
     assert ("field.warp", "two_way") in run  # by the paper's route alone

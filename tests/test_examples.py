@@ -26,6 +26,7 @@ from refield.estimate.register import RegisterConfig
 from refield.field import fit
 from refield.scene.images import read_image
 from refield.update.config import UpdateConfig
+from refield.update.fit_helper import HelperConfig
 from refield.update.train import update_field
 from refield.view.server import Viewer
 from refield.visits import opened
@@ -35,7 +36,7 @@ from tests.test_manual import typed
 
 pytestmark = pytest.mark.chain  # a minute or two in all
 ROOT = Path(__file__).parent.parent
-FEW = UpdateConfig(steps=40)
+FEW = UpdateConfig(fit=HelperConfig(steps=40))
 COARSE = EstimateConfig(
     hull=HullConfig(longest=64),
     objects=ObjectConfig(longest=48, rays=20000),
@@ -162,7 +163,7 @@ def test_update_twice(run, changed, tmp_path) -> None:
 
 def test_a_workspace(run, changed, work, tmp_path) -> None:
     shutil.copytree(work, tmp_path / "work")
-    few = ["--update.steps", "40"]
+    few = ["--update.fit.steps", "40"]
     assert main(["update", "work", str(changed.folder / "after"), *few]) == 0
     said = run("05_a_workspace.py", "work", "out", changed.folder / "after")
     assert "<visit 1: 1 object changed: 1 moved; seen in 4 new photos.>" in said

@@ -9,6 +9,7 @@ from refield.history import known_objects, retouched
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.images import frame_image
 from refield.update.composite import UpdatedField
+from refield.update.learnt import Learnt
 from refield.update.light import Relighting
 from refield.update.region import Region
 from tests.captures import write_capture
@@ -68,7 +69,7 @@ def test_photos_are_out_of_date_where_only_the_light_changed(tmp_path):
     scratch.mkdir()
     old = BallWorld((Ball(at(0.0, 0.0, 0.25), 0.25),))
     light = Relighting(torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.full((3, 3, 3, 3), -0.7))
-    now = UpdatedField(old, SceneChange(()), region=Region(()), light=light)
+    now = UpdatedField(old, SceneChange(()), Learnt(region=Region(()), light=light))
     assert not now.boxes
     later = retouched(capture, now, scratch)
     frame, was = later.frames[0], capture.frames[0]

@@ -18,11 +18,15 @@ from refield.field.render import render_frame
 from refield.scene.change import ObjectChange, OccupancyGrid
 from refield.scene.images import read_image, write_image
 from refield.update.config import UpdateConfig
+from refield.update.fit_helper import HelperConfig
+from refield.update.relight import RelightConfig
 from refield.visits.make import VisitConfig
 from tests.folders import contents
 from tests.test_cli import FEW, believing
 
-CONFIG = VisitConfig(update=UpdateConfig(steps=2, samples=512, relight=False))
+CONFIG = VisitConfig(
+    update=UpdateConfig(fit=HelperConfig(steps=2, samples=512), relight=RelightConfig(still=False, moved=False))
+)
 """what `FEW` says on the command line"""
 
 
@@ -64,9 +68,9 @@ def test_an_update_from_python_is_that_of_the_command_line(place, monkeypatch, c
     shutil.copytree("work", "other")
     shutil.move("other", place / "elsewhere" / "work")  # by the same name, which the report tells
     believing(monkeypatch, "moved", "added")
-    assert main(["update", "elsewhere/work", "new", "--evaluation", "new", *FEW, "--update.check-every", "1"]) == 0
+    assert main(["update", "elsewhere/work", "new", "--evaluation", "new", *FEW, "--update.fit.check-every", "1"]) == 0
     scene, stages, looks = refield.open(place / "work"), [], []
-    config = replace(CONFIG, update=replace(CONFIG.update, check_every=1))
+    config = replace(CONFIG, update=replace(CONFIG.update, fit=replace(CONFIG.update.fit, check_every=1)))
     made = scene.update("new", config, evaluation="new", on_stage=stages.append, on_progress=looks.append)
     assert capsys.readouterr().err.count("load the field") == 1  # of the command; Python hears, and prints nothing
     here, there = contents(place / "work"), contents(place / "elsewhere/work")

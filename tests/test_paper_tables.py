@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ import torch
 from refield.scene.files import write_json
 from refield.scene.images import write_image
 from refield.update.config import UpdateConfig
+from refield.update.fit_helper import HelperConfig
+from refield.update.relight import RelightConfig
 from refield.update.train import update_field
 from tests.baselines.test_baselines import capture, change, old
 from tests.captures import write_capture
@@ -30,7 +33,7 @@ def tables(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Any]]:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     yield importlib.import_module
     for name in set(sys.modules) - before:
-        if name.split(".")[0] in ("tables", "estimate", "record", "change_score", "paper_tables"):
+        if name.split(".")[0] in ("tables", "estimate", "record", "change_score", "paper_tables", "departures"):
             del sys.modules[name]
 
 
@@ -116,7 +119,7 @@ def test_what_was_found_is_shown(
 ) -> None:
     script, cases = tables("paper_tables"), tables("tables.cases")
     mine, docs = folder(tmp_path / "mine"), tmp_path / "docs" / "results.md"
-    results(tmp_path / "out" / f"steps_{script.FitConfig.steps}_{script.UpdateConfig.steps}", "mine")
+    results(tmp_path / "out" / f"steps_{script.FitConfig.steps}_{script.HelperConfig.steps}", "mine")
     monkeypatch.setattr(cases.Case, "frames", write_capture(tmp_path / "new", 2).frames)
     docs.parent.mkdir()
     docs.write_text("# Results\n\nOther figures.\n")
@@ -154,7 +157,8 @@ def test_a_watched_update_is_the_same_update(
     tables: Callable[[str], Any], capture: Any, change: Any, old: Any, tmp_path: Path
 ) -> None:
     watched = tables("tables.watched")
-    config = UpdateConfig(steps=10, check_every=5, samples=1024, relight=False)
+    unlit, few = RelightConfig(still=False, moved=False), HelperConfig(steps=10, check_every=5, samples=1024)
+    config = UpdateConfig(relight=unlit, fit=few)
     seen: list[int] = []
 
     def score(field: Any) -> dict[str, float | None]:
@@ -182,3 +186,19 @@ def test_shown_from_another_height(tables: Callable[[str], Any], tmp_path: Path)
             assert torch.allclose(pose[:3, 2], toward / toward.norm(), atol=1e-9)
             up = float(torch.rad2deg(torch.asin(-toward[2] / toward.norm())))
             assert up == pytest.approx(elevation, abs=1e-6)
+
+
+def test_each_departure_is_switched_off_by_itself(tables: Callable[[str], Any]) -> None:
+    """And all of them together; where to look for what a switch does, each row's name says."""
+    script = tables("departures")
+
+    def choices(config: UpdateConfig) -> set[tuple[str, str, Any]]:
+        stages = {k: v for k, v in asdict(config).items() if isinstance(v, dict) and k != "paper"}
+        return {(stage, name, value) for stage, own in stages.items() for name, value in own.items()}
+
+    usual, together = choices(script.DEFAULT), choices(script.OFF["all of these"])
+    singles = {name: choices(config) - usual for name, config in script.OFF.items() if name != "all of these"}
+    for row, found in singles.items():
+        ((stage, name, _),) = found
+        assert row.startswith(f"{stage}.{name.replace('_', '-')}")
+    assert set.union(*singles.values()) == together - usual

@@ -27,6 +27,7 @@ from refield.scene.errors import InputError
 from refield.scene.images import write_image
 from refield.scene.load import load_new_photos
 from refield.update.config import UpdateConfig
+from refield.update.supervision import SuperviseConfig
 from refield.vision.perceptual import Perceptual
 from tables.cases import BOTTOM, TOP, Case
 from tables.kept import Kept, Record
@@ -62,7 +63,7 @@ class Lab:
         self.warmed.add(case.key)
         change = estimate_change(case.capture, case.field, case.frames)
         short = replace(self.fit, steps=20)
-        updated(case.capture, case.field, change, replace(self.update, steps=20))
+        updated(case.capture, case.field, change, replace(self.update, fit=replace(self.update.fit, steps=20)))
         evaluate(retrain(case.capture, change, short), case.evaluation)
 
 
@@ -184,13 +185,26 @@ def ours(lab: Lab, case: Case) -> Record:
 def no_adjacent(lab: Lab, case: Case) -> Record:
     """×OA: the helper only inside the object's own grid, and old photos teach nothing around it (Fig. 9b)."""
     return _updated(
-        lab, case, "no_adjacent", change_of(lab, case), replace(lab.update, dilation=1.0, ground=1.0, far=0.0)
+        lab,
+        case,
+        "no_adjacent",
+        change_of(lab, case),
+        replace(
+            lab.update,
+            cut=replace(lab.update.cut, dilation=1.0),
+            ground=replace(lab.update.ground, reach=1.0),
+            supervise=_without_old(lab),
+        ),
     )
+
+
+def _without_old(lab: Lab) -> SuperviseConfig:
+    return replace(lab.update.supervise, far=0.0)
 
 
 def no_old(lab: Lab, case: Case) -> Record:
     """The helper where it usually is, taught by the new photos alone."""
-    return _updated(lab, case, "no_old", change_of(lab, case), replace(lab.update, far=0.0))
+    return _updated(lab, case, "no_old", change_of(lab, case), replace(lab.update, supervise=_without_old(lab)))
 
 
 def no_refine(lab: Lab, case: Case) -> Record:

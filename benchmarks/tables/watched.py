@@ -6,7 +6,7 @@ import itertools
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from refield.baselines.curve import Point, Score
 from refield.field.radiance import HashField
@@ -31,8 +31,7 @@ class Snapshot:
     def field(self) -> UpdatedField:
         """What the update would have given had it ended here."""
         f = self.frozen
-        lit = {"region": f.region, "light": f.light, "shading": f.shading, "eyes": f.eyes, "bare": f.bare}
-        return UpdatedField(f.pretrained, f.change, self.helper, earlier=f.earlier, **lit)
+        return f.but(learnt=replace(f.learnt, helper=self.helper))
 
 
 @contextmanager

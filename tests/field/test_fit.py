@@ -14,19 +14,14 @@ from PIL import Image
 
 from refield.field import kernels
 from refield.field.descent import MOST_SKIPPED, NonFiniteError
-from refield.field.fit import (
-    FitConfig,
-    FitProgress,
-    _Fit,
-    fit_field,
-    rate_factor,
-)
+from refield.field.fit import FitConfig, FitProgress, _Fit, fit_field
 from refield.field.memory import memory_of
 from refield.field.photos import HeldOut, Photos, Since
 from refield.field.pixels import PixelBank
 from refield.field.placing import place_contraction
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_frame
+from refield.field.schedule import at_plateau, rate_factor
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.errors import InputError
@@ -216,6 +211,14 @@ def test_learning_rate_is_held_then_falls() -> None:
     assert rate_factor(0.0) == rate_factor(0.5) == 1
     assert 0.03 < rate_factor(1.0) < 0.04
     assert rate_factor(0.9) < rate_factor(0.7) < 1
+
+
+def test_training_ends_when_held_out_pixels_stop_gaining() -> None:
+    config = FitConfig(patience=2, least_gain=0.1)
+    assert not at_plateau([20.0, 20.0], config)  # too few looks to say
+    assert not at_plateau([20.0, 20.05, 20.1], config)
+    assert at_plateau([20.0, 20.05, 20.09], config)
+    assert at_plateau([22.0, 20.0, 21.0], config)
 
 
 def broken(monkeypatch: pytest.MonkeyPatch, bad: Callable[[int], bool], gradient: bool) -> list[int]:

@@ -196,7 +196,14 @@ def test_a_workspace_like_any_other(run, monkeypatch, capsys):
     shutil.copytree("photos", "new")
     told = json.loads(Path("new/transforms.json").read_text())
     Path("new/transforms.json").write_text(json.dumps({**told, "frames": told["frames"][:4]}))
-    few = ["--update.steps", "2", "--update.samples", "512", "--update.no-relight"]
+    few = [
+        "--update.fit.steps",
+        "2",
+        "--update.fit.samples",
+        "512",
+        "--update.relight.no-still",
+        "--update.relight.no-moved",
+    ]
     assert main(["update", "work", "new", *few]) == 0
     assert main(["visits", "work"]) == 0
     assert "moved" in capsys.readouterr().out

@@ -115,11 +115,12 @@ def test_an_unknown_image_is_refused(views):
 def test_the_commuting_square(world, field):
     """Updating the old world's field by the true change shows the new world."""
     from refield.update.composite import UpdatedField
+    from refield.update.learnt import Learnt
 
     (change,) = world.changes
     true = SceneChange((ObjectChange("moved", change.old.grid(), change.new_from_old),))
     after = AnalyticField(world.after)
-    updated = UpdatedField(field, true, after)
+    updated = UpdatedField(field, true, Learnt(after))
     for pose in ring(world.target)[::3]:
         wanted, got = (render_camera(f, CAMERA, pose) for f in (after, updated))
         error = (wanted.rgb - got.rgb).abs().amax(-1)

@@ -10,6 +10,7 @@ from refield.field.volrend import Samples, composite, interleaved
 from refield.field.warp import crosses
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.update.composite import UpdatedField
+from refield.update.learnt import Learnt
 from refield.update.light import Relighting
 from refield.update.region import carved, move_out
 from tests.fields import small_field
@@ -40,7 +41,7 @@ def test_nothing_changed_changes_nothing() -> None:
 def test_commuting_square_for_a_moved_object() -> None:
     """render(world after) = render(update(world before)): the floor hides no part of what the helper must know."""
     before, after = BallWorld((OLD, BESIDE)), BallWorld((NEW, BESIDE))
-    updated = UpdatedField(before, change_of(moved(OLD, NEW_POSE)), helper=after)
+    updated = UpdatedField(before, change_of(moved(OLD, NEW_POSE)), Learnt(after))
     assert agreement(rgb(before), rgb(after)) < 24  # the move shows
     assert agreement(rgb(updated), rgb(after)) > 34
     # the sampler's cells were recomputed: nothing is missing at the new place, nothing is left at the old
@@ -52,14 +53,14 @@ def test_commuting_square_for_two_moved_objects_that_swap() -> None:
     a, b = OLD, Ball(at(0.4, -0.3, 0.25), 0.25)
     to_b, to_a = at(0.4, -0.3, 0.25, 0.5), at(-0.5, 0.2, 0.25, -0.4)
     before, after = BallWorld((a, b)), BallWorld((Ball(to_b, 0.25), Ball(to_a, 0.25)))
-    updated = UpdatedField(before, change_of(moved(a, to_b), moved(b, to_a)), helper=after)
+    updated = UpdatedField(before, change_of(moved(a, to_b), moved(b, to_a)), Learnt(after))
     assert agreement(rgb(updated), rgb(after)) > 34
 
 
 def test_commuting_square_for_removed_and_added() -> None:
     before, after = BallWorld((OLD,)), BallWorld((BESIDE,))
     change = change_of(ObjectChange("removed", grid_of(OLD)), ObjectChange("added", grid_of(BESIDE)))
-    updated = UpdatedField(before, change, helper=after)
+    updated = UpdatedField(before, change, Learnt(after))
     assert agreement(rgb(updated), rgb(after)) > 40
 
 
@@ -87,8 +88,8 @@ def test_there_and_back_again() -> None:
     there = change_of(moved(OLD, NEW_POSE))
     back = change_of(moved(NEW, OLD.world_from_ball))
     empty = BallWorld((BESIDE,))  # what both places look like without the object
-    second = UpdatedField(first, there, helper=empty)
-    third = UpdatedField(second, back, helper=empty)
+    second = UpdatedField(first, there, Learnt(empty))
+    third = UpdatedField(second, back, Learnt(empty))
     assert agreement(rgb(second), rgb(first)) < 24
     assert agreement(rgb(third), rgb(first)) > 32
 
@@ -97,25 +98,25 @@ def test_move_in_wins_where_it_overlaps_the_region() -> None:
     near = at(-0.3, 0.2, 0.25, 0.3)
     before, after = BallWorld((OLD,)), BallWorld((Ball(near, 0.25),))
     empty = BallWorld(())
-    updated = UpdatedField(before, change_of(moved(OLD, near)), helper=empty)
+    updated = UpdatedField(before, change_of(moved(OLD, near)), Learnt(empty))
     assert move_out(updated.change, 2.0).contains(torch.tensor([[-0.3, 0.2, 0.25]])).all()
     assert agreement(rgb(updated), rgb(after)) > 32
 
 
 def test_a_moved_object_takes_along_what_is_right_beneath_it_and_no_ground_beside() -> None:
-    updated = UpdatedField(BallWorld((OLD,)), change_of(moved(OLD, NEW_POSE)), helper=BallWorld(()))
+    updated = UpdatedField(BallWorld((OLD,)), change_of(moved(OLD, NEW_POSE)), Learnt(BallWorld(())))
     beneath = torch.tensor([[0.4, -0.3, -0.005], [0.45, -0.33, -0.01]])
     assert (updated.arrived(beneath) == 0).all()
     beside = torch.tensor([[0.55, -0.3, -0.005], [0.4, -0.6, -0.01], [0.4, -0.3, -0.06]])
     assert (updated.arrived(beside) == -1).all()
     aloft = at(0.4, -0.3, 0.5)
-    hanging = UpdatedField(BallWorld((OLD,)), change_of(moved(OLD, aloft)), helper=BallWorld(()))
+    hanging = UpdatedField(BallWorld((OLD,)), change_of(moved(OLD, aloft)), Learnt(BallWorld(())))
     assert (hanging.arrived(beneath) == -1).all()
 
 
 def test_gradients_reach_the_positions() -> None:
     """A second estimate refines a pose through an updated field."""
-    updated = UpdatedField(BallWorld((OLD,)), change_of(moved(OLD, NEW_POSE)), helper=BallWorld(()))
+    updated = UpdatedField(BallWorld((OLD,)), change_of(moved(OLD, NEW_POSE)), Learnt(BallWorld(())))
     x = (NEW.world_from_ball[:3, 3].float() + 0.05 * torch.randn(50, 3)).requires_grad_()
     _, colour = updated(x, torch.nn.functional.normalize(torch.randn(50, 3), dim=-1))
     (slope,) = torch.autograd.grad(colour.sum(), x)
@@ -165,7 +166,7 @@ def test_leaving_out_what_is_hidden_leaves_the_picture() -> None:
     twice = UpdatedField(once, change_of(moved(NEW, at(0.0, 0.9, 0.3))))
     rays = views()
     for field in (once, twice):
-        few, every = field.samples(rays), interleaved(*(part(rays) for part in field._split))
+        few, every = field.samples(rays), interleaved(*(part(rays) for part in field._marching.split))
         assert len(few) < 0.8 * len(every)
         seen = [composite(*field(*s.positions(rays)), s).rgb for s in (few, every)]
         assert float((seen[0] - seen[1]).abs().max()) < 5e-3
@@ -184,7 +185,7 @@ def test_rays_that_meet_nothing_that_changed_show_the_old_field_bit_for_bit() ->
     gain = torch.zeros(9, 9, 9, 3)
     gain[3:6, 3:6, 3:6] = -2.0
     light = Relighting(torch.tensor([[-1.2, -1.2, -0.2], [-0.4, -0.4, 0.6]]), gain)
-    updated = UpdatedField(before, change, helper=wrong, light=light)
+    updated = UpdatedField(before, change, Learnt(wrong, light=light))
     rays = views(64)
     was, now = render_many(before, rays), render_many(updated, rays)
     (was_there,), (is_there,) = [o.grid for o in change.objects], [o.grid_now for o in change.objects]

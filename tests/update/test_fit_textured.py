@@ -16,9 +16,10 @@ from refield.scene.camera import Camera
 from refield.scene.capture import camera_rays
 from refield.scene.change import ObjectChange
 from refield.scene.planes import Plane
-from refield.update.composite import NOWHERE, UpdatedField
+from refield.update.composite import UpdatedField
 from refield.update.fit_textured import _apart, textured_planes
 from refield.update.ground import footholds
+from refield.update.learnt import NOWHERE
 from refield.update.region import Region, move_out
 from refield.update.supervision import Lessons
 from refield.update.textured import TexturedPlane
@@ -60,7 +61,7 @@ def photos(world: Field, turns: Sequence[float]) -> Lessons:
         near = render_many(world, rays)
         first = (near.depth < t - 0.05) & (near.opacity > 0.5)
         rgb = torch.where(first[:, None], near.rgb, exact)
-        parts.append(Lessons(rays, rgb, torch.full((n,), i), torch.arange(n)))
+        parts.append(Lessons(rays, rgb, torch.full((n,), i), torch.arange(n), torch.zeros(n, dtype=torch.bool)))
     first, *rest = parts
     for part in rest:
         first = first.followed_by(part)

@@ -9,13 +9,14 @@ from refield.field.volrend import Samples, accumulate_rgb
 from refield.scene.capture import Rays
 from refield.update.composite import UpdatedField
 from refield.update.frozen import Segments, composite_once, weave
+from refield.update.learnt import Learnt
 from refield.update.region import move_out
 from tests.update.worlds import STEP, Ball, BallWorld, at, change_of, moved, views
 
 OLD, NEW_POSE = Ball(at(-0.5, 0.2, 0.25), 0.25), at(0.0, 0.2, 0.25, yaw=1.0)
 CHANGE = change_of(moved(OLD, NEW_POSE))
 WIDE = move_out(CHANGE, 2.0)
-FROZEN = UpdatedField(BallWorld((OLD, Ball(at(0.3, 0.6, 0.3), 0.3))), CHANGE, region=WIDE)
+FROZEN = UpdatedField(BallWorld((OLD, Ball(at(0.3, 0.6, 0.3), 0.3))), CHANGE, Learnt(region=WIDE))
 
 
 def nothing(n: int) -> Samples:
@@ -45,7 +46,7 @@ def test_weaving_a_helper_in_is_rendering_the_updated_field() -> None:
     sigmas, rgbs = helper(x, d)
     moved_there = FROZEN.moves[0].arrived(x)  # the moved object is among the fixed segments
     seen = shown(fixed, samples, torch.where(moved_there, 0.0, sigmas), rgbs)
-    whole = render_many(UpdatedField(FROZEN.pretrained, CHANGE, helper), rays).rgb
+    whole = render_many(UpdatedField(FROZEN.pretrained, CHANGE, Learnt(helper)), rays).rgb
     # two lattices of the same step: surfaces are met half a step apart
     assert float((seen - whole).abs().mean()) < 0.01
     assert float((seen - render_many(FROZEN, rays).rgb).abs().mean()) > 0.01

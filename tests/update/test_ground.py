@@ -42,15 +42,21 @@ def asked(change, x, planes, taken=()):
 def test_the_floor_is_found_around_what_left():
     torch.manual_seed(0)
     box = torch.tensor([[-0.3, -0.3, 0.0], [0.3, 0.3, 0.5]])
-    (plane,) = planes_around(floor_points(2000), box, EYES, 0.01)
+    (plane,) = planes_around(floor_points(2000), box, EYES, 0.01, torch.Generator().manual_seed(0))
     assert plane.normal[2] > 0.999 and abs(plane.offset) < 0.002
-    assert planes_around(floor_points(20), box, EYES, 0.01) == []
-    assert planes_around(torch.rand(2000, 3), box, EYES, 0.01) == []  # nothing flat
+    assert planes_around(floor_points(20), box, EYES, 0.01, torch.Generator().manual_seed(0)) == []
+    assert planes_around(torch.rand(2000, 3), box, EYES, 0.01, torch.Generator().manual_seed(0)) == []  # nothing flat
 
 
 def test_above_the_floor_that_it_stood_on_is_nothing():
     torch.manual_seed(0)
-    planes = planes_around(floor_points(2000), torch.tensor([[-0.3, -0.3, 0.0], [0.3, 0.3, 0.5]]), EYES, 0.01)
+    planes = planes_around(
+        floor_points(2000),
+        torch.tensor([[-0.3, -0.3, 0.0], [0.3, 0.3, 0.5]]),
+        EYES,
+        0.01,
+        torch.Generator().manual_seed(0),
+    )
     standing = SceneChange((box_at(0.0),))
     skin = torch.tensor([[0.17, 0.0, 0.2], [0.0, 0.0, 0.37]])  # just inside of a side and the top
     ground = torch.tensor([[0.0, 0.0, 0.01], [0.1, -0.1, 0.03]])
@@ -130,7 +136,13 @@ def test_a_place_that_is_no_object_s_own_is_as_empty():
 
 def test_a_plane_that_it_did_not_touch_says_nothing():
     torch.manual_seed(0)
-    planes = planes_around(floor_points(2000), torch.tensor([[-0.3, -0.3, 0.0], [0.3, 0.3, 0.5]]), EYES, 0.01)
+    planes = planes_around(
+        floor_points(2000),
+        torch.tensor([[-0.3, -0.3, 0.0], [0.3, 0.3, 0.5]]),
+        EYES,
+        0.01,
+        torch.Generator().manual_seed(0),
+    )
     above = SceneChange((box_at(0.3),))
     bottom = torch.tensor([[0.0, 0.0, 0.315]])
     assert (asked(above, bottom, planes) == 0).all()

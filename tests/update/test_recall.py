@@ -9,7 +9,8 @@ from refield.field.render import render_rays
 from refield.scene.capture import Rays
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.pose import invert, rotate, transform
-from refield.update.composite import Origin, UpdatedField, source_of
+from refield.update.composite import UpdatedField, source_of
+from refield.update.learnt import Learnt, Origin
 from refield.update.light import Relighting
 from refield.update.recall import earlier_of, without
 from refield.update.region import Region, carved, move_out
@@ -28,7 +29,7 @@ def first_visit() -> tuple[BallWorld, UpdatedField]:
     """A ball went from HERE to THERE; the helper knows the floor."""
     before, after = BallWorld((ball(),)), BallWorld((ball(THERE),))
     change = SceneChange((moved(ball(), THERE),))
-    return before, UpdatedField(before, change, helper=after)
+    return before, UpdatedField(before, change, Learnt(after))
 
 
 def next_move(to: torch.Tensor) -> ObjectChange:
@@ -58,9 +59,9 @@ def test_however_often_it_moved_it_is_looked_up_where_it_first_was():
     # after the first visit the light changes where it stands now, by a visit that moves something else
     light = Relighting(move_out(SceneChange((moved(ball(THERE), BEYOND),)), 1.5).box, -nodes)
     far = moved(Ball(at(0.0, 0.9, 0.25), 0.1), at(0.0, 1.2, 0.25))
-    once = UpdatedField(before, SceneChange((moved(ball(), THERE),)), shading=(shades[0],))
-    lit = UpdatedField(once, SceneChange((far,)), light=light)
-    twice = UpdatedField(lit, SceneChange((next_move(BEYOND),)), shading=(shades[1],))
+    once = UpdatedField(before, SceneChange((moved(ball(), THERE),)), Learnt(shading=(shades[0],)))
+    lit = UpdatedField(once, SceneChange((far,)), Learnt(light=light))
+    twice = UpdatedField(lit, SceneChange((next_move(BEYOND),)), Learnt(shading=(shades[1],)))
     (source,) = twice.sources
     assert source is not None and source.field is before and len(source.lights) == 2
     assert torch.allclose(source.now_from_then, THERE @ invert(HERE))
@@ -82,7 +83,7 @@ def test_however_often_it_moved_it_is_looked_up_where_it_first_was():
 def test_what_it_takes_along_that_it_never_had_before_is_not_looked_up_there():
     low, high = ball(THERE), Ball(at(0.4, 0.3, 0.58), 0.08)  # another thing, on top of it
     before = BallWorld((ball(), high))
-    once = UpdatedField(before, SceneChange((moved(ball(), THERE),)), helper=before)
+    once = UpdatedField(before, SceneChange((moved(ball(), THERE),)), Learnt(before))
     both = OccupancyGrid(torch.tensor([[0.1, 0.0, -0.05], [0.7, 0.6, 0.7]]), torch.zeros(31, 31, 38))
     held = [grid_of(b).contains(both.nodes()) for b in (low, high)]
     change = SceneChange(
@@ -97,11 +98,11 @@ def test_what_it_takes_along_that_it_never_had_before_is_not_looked_up_there():
 
 def test_what_a_helper_has_learnt_of_an_object_is_looked_up_there():
     before, _ = first_visit()
-    came = UpdatedField(before, SceneChange((ObjectChange("added", grid_of(ball(BEYOND))),)), helper=before)
+    came = UpdatedField(before, SceneChange((ObjectChange("added", grid_of(ball(BEYOND))),)), Learnt(before))
     assert source_of(came, grid_of(ball(BEYOND))) is None
     assert source_of(before, grid_of(ball())) is None
     bare = Region((grid_of(Ball(THERE, 0.1)),))
-    part = UpdatedField(before, SceneChange((moved(ball(), THERE),)), helper=before, bare=bare)
+    part = UpdatedField(before, SceneChange((moved(ball(), THERE),)), Learnt(before, bare=bare))
     assert source_of(part, grid_of(ball(THERE))) is None
 
 
@@ -144,7 +145,7 @@ def test_a_move_in_two_steps_is_taken_back_in_one():
 def test_a_newcomer_that_was_moved_leaves_again():
     before = BallWorld(())
     came = SceneChange((ObjectChange("added", grid_of(ball())),))
-    now = UpdatedField(before, came, helper=BallWorld((ball(),)))
+    now = UpdatedField(before, came, Learnt(BallWorld((ball(),))))
     on = SceneChange((moved(ball(), THERE),))
     base, earlier = earlier_of(now, on, 1.5)
     assert earlier.left == (Origin(0, 0, 0),)
@@ -157,7 +158,7 @@ def test_a_newcomer_that_was_moved_leaves_again():
 def test_what_was_removed_and_is_put_back():
     before = BallWorld((ball(), ball(BEYOND)))
     gone = SceneChange((ObjectChange("removed", grid_of(ball())), ObjectChange("removed", grid_of(ball(BEYOND)))))
-    now = UpdatedField(before, gone, helper=BallWorld(()))
+    now = UpdatedField(before, gone, Learnt(BallWorld(())))
     change = SceneChange((ObjectChange("added", grid_of(ball())),))
     base, earlier = earlier_of(now, change, 1.5)
     assert earlier.undone == (Origin(0, 0, 0),)
@@ -170,7 +171,7 @@ def test_what_was_removed_and_is_put_back():
 def test_a_newcomer_that_leaves_again():
     before = BallWorld(())
     came = SceneChange((ObjectChange("added", grid_of(ball())), ObjectChange("added", grid_of(ball(BEYOND)))))
-    now = UpdatedField(before, came, helper=BallWorld((ball(), ball(BEYOND))))
+    now = UpdatedField(before, came, Learnt(BallWorld((ball(), ball(BEYOND)))))
     change = SceneChange((ObjectChange("removed", grid_of(ball())),))
     base, earlier = earlier_of(now, change, 1.5)
     left = UpdatedField(base, change, earlier=earlier)
@@ -192,7 +193,7 @@ def test_what_never_moved_has_no_earlier():
 def test_an_edit_goes_through_later_layers():
     _, now = first_visit()
     other = SceneChange((ObjectChange("removed", grid_of(ball(BEYOND))),))
-    later = UpdatedField(now, other, helper=BallWorld(()))
+    later = UpdatedField(now, other, Learnt(BallWorld(())))
     change = SceneChange((next_move(BEYOND),))
     _, earlier = earlier_of(later, change, 1.5)
     assert earlier.left == (Origin(0, 1, 0),)
@@ -204,7 +205,7 @@ def test_an_edit_goes_through_later_layers():
 def test_it_is_stored(tmp_path):
     old = small_field(0)
     there = SceneChange((moved(ball(), THERE), ObjectChange("removed", grid_of(ball(BEYOND)))))
-    now = UpdatedField(old, there, small_field(1))
+    now = UpdatedField(old, there, Learnt(small_field(1)))
     for change in (SceneChange((next_move(at(0.6, 0.6, 0.3)),)), SceneChange((next_move(HERE),))):
         base, earlier = earlier_of(now, change, 1.5)
         assert earlier

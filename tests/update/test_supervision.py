@@ -13,10 +13,11 @@ import torch
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, camera_rays
 from refield.scene.change import ObjectChange, SceneChange
-from refield.scene.images import frame_image
+from refield.scene.images import frame_image, write_image
 from refield.update import supervision
 from refield.update.supervision import (
     Places,
+    SuperviseConfig,
     changed_pixels,
     exposure,
     new_lessons,
@@ -103,10 +104,13 @@ def test_of_a_large_photo_some_pixels_teach(tmp_path: Path, monkeypatch: pytest.
     assert small.shape == whole.shape and (small & whole).sum() / (small | whole).sum() > 0.75
     masks = [np.zeros((camera.height, camera.width), bool) for _ in frames]
     masks[1][:, 10:20] = True
-    lessons = new_lessons(frames, BallWorld((BALL,)), masks)
+    draw = torch.Generator().manual_seed(0)
+    lessons = new_lessons(frames, BallWorld((BALL,)), masks, SuperviseConfig(), draw)
     assert [int((lessons.photo == i).sum()) for i in range(2)] == [500, 500]
     small = write_capture(tmp_path / "small", 1, camera.scaled(16, 12)).frames
-    mixed = new_lessons((*frames, *small), BallWorld((BALL,)), [*masks, np.zeros((12, 16), bool)])
+    mixed = new_lessons(
+        (*frames, *small), BallWorld((BALL,)), [*masks, np.zeros((12, 16), bool)], SuperviseConfig(), draw
+    )
     assert [int((mixed.photo == i).sum()) for i in range(3)] == [500, 500, 16 * 12], "each on its own"
     u = lessons.place % camera.width
     assert torch.equal(lessons.within(masks), (lessons.photo == 1) & (u >= 10) & (u < 20))
@@ -120,6 +124,25 @@ def test_of_a_large_photo_some_pixels_teach(tmp_path: Path, monkeypatch: pytest.
             clear = ((shown > 0.01) & (shown < 0.99)).numpy()
             line = np.polyfit(pixel.numpy()[clear], shown.numpy()[clear], 1)
             assert clear.any() and np.abs(np.polyval(line, pixel.numpy()) - shown.numpy())[clear].max() < 1e-4
+
+
+def test_pixels_kept_to_judge_by_teach_nothing_of_the_exposure(tmp_path: Path) -> None:
+    """They are drawn first: another colour in them changes nothing of the others."""
+    frames, world = write_capture(tmp_path, 1).frames, BallWorld((BALL,))
+
+    def told() -> supervision.Lessons:
+        masks = [np.zeros((f.camera.height, f.camera.width), bool) for f in frames]
+        return new_lessons(frames, world, masks, SuperviseConfig(held_out=3), torch.Generator().manual_seed(0))
+
+    first = told()
+    assert 0.25 < float(first.held.float().mean()) < 0.42
+    assert len(first.taught) + len(first.judging) == len(first) and not first.taught.held.any()
+    image = frame_image(frames[0]).reshape(-1, 3).clone()
+    image[first.place[first.held]] = 255 - image[first.place[first.held]]
+    write_image(frames[0].path, image.reshape(frames[0].camera.height, frames[0].camera.width, 3).float() / 255)
+    again = told()
+    assert torch.equal(first.held, again.held) and torch.equal(first.taught.rgb, again.taught.rgb)
+    assert not torch.equal(first.judging.rgb, again.judging.rgb)
 
 
 def test_changed_pixels_hold_both_places() -> None:

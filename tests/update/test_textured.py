@@ -11,7 +11,8 @@ from torch.nn import functional
 from refield.field.render import render_many
 from refield.scene.capture import Rays
 from refield.scene.change import ObjectChange
-from refield.update.composite import Origin, UpdatedField
+from refield.update.composite import UpdatedField
+from refield.update.learnt import Learnt, Origin
 from refield.update.recall import without
 from refield.update.region import Region, carved, forgotten, move_out, without_planes
 from refield.update.textured import TexturedPlane
@@ -80,8 +81,8 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
 def test_an_updated_field_shows_it_in_place_of_what_was_there() -> None:
     change, after = change_of(ObjectChange("removed", grid_of(OLD))), render_many(BallWorld(()), views()).rgb
     gone = carved(change, 0.03)
-    plain = UpdatedField(hollow(), change, region=gone)
-    shown = UpdatedField(hollow(), change, region=Region(gone.grids, (floor(),)))
+    plain = UpdatedField(hollow(), change, Learnt(region=gone))
+    shown = UpdatedField(hollow(), change, Learnt(region=Region(gone.grids, (floor(),))))
     assert psnr(render_many(plain, views()).rgb, after) < 26
     assert psnr(render_many(shown, views()).rgb, after) > 33
     sigma, _ = shown(torch.tensor([[-0.5, 0.2, -0.01], [-0.5, 0.2, 0.01]]), torch.tensor([[0.0, 0.0, -1.0]] * 2))
@@ -91,7 +92,7 @@ def test_an_updated_field_shows_it_in_place_of_what_was_there() -> None:
 
 def test_what_moved_in_goes_before_it() -> None:
     change = change_of(moved(OLD, at(-0.2, 0.2, 0.25)))
-    field = UpdatedField(hollow(), change, region=Region(carved(change).grids, (floor(side=1.4),)))
+    field = UpdatedField(hollow(), change, Learnt(region=Region(carved(change).grids, (floor(side=1.4),))))
     x = torch.tensor([[-0.2, 0.2, 0.005]])  # in the ball, and right above the floor
     assert field.density(x) > 100
 
@@ -119,7 +120,7 @@ def test_an_object_that_leaves_again_takes_its_shadow_along() -> None:
     there = at(0.5, -0.3, 0.25)
     change = change_of(moved(OLD, there))
     region = Region(move_out(change, 1.5).grids, (floor((0.0, 0.0), 2.4, 0.02),))
-    field = UpdatedField(hollow(), change, BallWorld((), floor=False), region=region)
+    field = UpdatedField(hollow(), change, Learnt(BallWorld((), floor=False), region=region))
     left = without(field, Origin(0, 0, 0), departed=True)
     assert isinstance(left, UpdatedField)
     first, last = torch.tensor([[-0.5, 0.2, 0.0]]), torch.tensor([[0.5, -0.3, 0.0]])

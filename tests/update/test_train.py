@@ -5,32 +5,46 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from refield.field.radiance import Field
+from refield.field.radiance import Field, HashField
 from refield.field.render import render_camera, render_many
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.images import write_image
-from refield.update import train
+from refield.update import fit_textured, relight, supervision, train
 from refield.update.config import UpdateConfig
-from refield.update.light import Sightings
-from refield.update.supervision import changed_pixels, places_of
+from refield.update.cut import CutConfig
+from refield.update.fit_helper import HelperConfig, HelperTraining, Lit
+from refield.update.frozen import FreezeConfig
+from refield.update.ground import GroundConfig
+from refield.update.light import Relighting, Sightings
+from refield.update.relight import RelightConfig
+from refield.update.spared import ShowConfig
+from refield.update.supervision import Lessons, SuperviseConfig, changed_pixels, places_of
 from refield.update.train import UpdateProgress, update_field
 from refield.vision.pixels import dilate
 from tests.update.worlds import Ball, BallWorld, at, looking_from, moved
 
 SIZE = 48
 CAMERA = Camera(SIZE, SIZE, 62.0, 62.0, SIZE / 2, SIZE / 2)
+
+
+def steps(count: int, **more: Any) -> UpdateConfig:
+    return UpdateConfig(fit=HelperConfig(steps=count, max_seconds=600), **more)
+
+
 OLD = Ball(at(-0.35, 0.1, 0.22), 0.25)  # it has sunk into the floor: a dent there was never seen
 NEW_POSE = at(0.45, -0.3, 0.22, yaw=0.6)
 NEW = Ball(NEW_POSE, 0.25)
 BEFORE, AFTER = BallWorld((OLD,)), BallWorld((NEW,))
-QUICK = UpdateConfig(steps=300, max_seconds=60)
+QUICK = steps(300)
 
 
 class Hidden:
@@ -103,8 +117,8 @@ def test_light_is_learnt_up_to_the_objects_edges(
 ) -> None:
     capture, change = case
     asked: list[Sightings] = []
-    monkeypatch.setattr(train, "fit_light", lambda seen, *more: asked.append(seen))
-    update_field(capture, OLD_FIELD, change, replace(QUICK, steps=1))
+    monkeypatch.setattr(relight, "fit_light", lambda seen, *more: asked.append(seen))
+    update_field(capture, OLD_FIELD, change, steps(1))
     frame, seen = change.frames[0], asked[0]
     changed = changed_pixels(change, places_of(change), 0, frame)
     m = frame.world_from_cam.float()
@@ -114,6 +128,75 @@ def test_light_is_learnt_up_to_the_objects_edges(
     assert not (told & changed).any()
     ring = dilate(changed, 1) & ~changed
     assert (told & ring).sum() > 0.5 * ring.sum()
+
+
+def test_the_seed_alone_says_what_is_drawn(case: tuple[Capture, SceneChange]) -> None:
+    capture, change = case
+    few, tables = steps(20), []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        updated, drawn = update_field(capture, OLD_FIELD, change, few), torch.rand(1)
+        torch.manual_seed(seed)
+        assert torch.equal(drawn, torch.rand(1)), "torch's own generator was drawn from"
+        assert isinstance(updated.helper, HashField)
+        tables.append((updated.helper.encoding.tables, updated.sampler.grid))
+    assert all(torch.equal(a, b) for a, b in zip(*tables))
+
+
+def test_what_judges_is_never_fitted_to(case: tuple[Capture, SceneChange], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither light nor shading, ground or helper; and the parts of the update are judged by nothing else."""
+    capture, change = case
+    taught: list[Lessons] = []
+    judged: list[Lessons] = []
+
+    def wrapped(room: ModuleType, name: str, told: list[Lessons], at: int) -> None:
+        own = getattr(room, name)
+        monkeypatch.setattr(room, name, lambda *given, **more: (told.append(given[at]), own(*given, **more))[1])
+
+    wrapped(relight, "at_most_of", taught, 0)
+    wrapped(fit_textured, "textured_planes", taught, 5)
+    wrapped(train, "spared", judged, 1)
+    own = train.HelperTraining
+
+    def watched(helper: HashField, frozen: Field, sparse: Lit, old: Lit, judge: Lit, *more: Any) -> HelperTraining:
+        taught.extend([sparse.lessons, old.lessons])
+        judged.append(judge.lessons)
+        return own(helper, frozen, sparse, old, judge, *more)
+
+    monkeypatch.setattr(train, "HelperTraining", watched)
+    update_field(capture, OLD_FIELD, change, steps(1))
+    assert len(taught) == 5 and len(judged) == 2  # light, shading, ground, new and old photos
+    assert all(len(t) and not t.held.any() for t in taught) and all(len(j) and j.held.all() for j in judged)
+
+
+def test_every_departure_from_the_paper_can_be_switched_off(
+    case: tuple[Capture, SceneChange], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture, change = case
+    judged: list[Lessons] = []
+    own = train.spared
+    monkeypatch.setattr(train, "spared", lambda *given: (judged.append(given[1]), own(*given))[1])
+    usual = update_field(capture, OLD_FIELD, change, steps(1))
+    assert len(judged) == 1
+    off = steps(
+        1,
+        cut=CutConfig(recall=False, sides=False, bare=False),
+        relight=RelightConfig(still=False, moved=False),
+        supervise=SuperviseConfig(exposure=False),
+        ground=GroundConfig(footholds=False),
+        freeze=FreezeConfig(unseen=False),
+        show=ShowConfig(spared=False),
+    )
+    off = replace(off, fit=replace(off.fit, directions=True, sparse_share=None))
+    plain = update_field(capture, OLD_FIELD, change, off)
+    assert len(judged) == 1
+    assert usual.eyes is not None and plain.eyes is None
+    assert usual.shading and plain.shading == () and plain.light is None
+    assert len(usual.unseen) and not len(plain.unseen)
+    assert usual.region.planes and not plain.region.planes
+    for updated, some in ((usual, False), (plain, True)):
+        assert isinstance(updated.helper, HashField)
+        assert bool(updated.helper.networks[2][:, updated.helper.config.geometry_features + 1 :].any()) == some
 
 
 def test_without_new_photos_things_are_only_moved(case: tuple[Capture, SceneChange]) -> None:
@@ -135,5 +218,19 @@ def test_photos_that_look_away_only_move_things(case: tuple[Capture, SceneChange
     away = change.frames[0].world_from_cam.clone()
     away[:3, 0], away[:3, 2] = -away[:3, 0], -away[:3, 2]
     photo = replace(change.photos[0], frame=replace(change.frames[0], world_from_cam=away))
-    updated = update_field(capture, OLD_FIELD, SceneChange(change.objects, (photo,)), replace(QUICK, steps=50))
+    updated = update_field(capture, OLD_FIELD, SceneChange(change.objects, (photo,)), steps(50))
     assert len(updated.moves) == 1 and math.isfinite(error(updated))
+
+
+def test_light_stays_where_no_photo_shows_what_left(
+    case: tuple[Capture, SceneChange], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is learnt of the light does not hang on there being something for a helper to learn."""
+    capture, change = case
+    light = Relighting(torch.tensor([[-2.0, -2, -2], [2, 2, 2]]), torch.zeros(3, 3, 3, 3))
+    monkeypatch.setattr(relight, "fit_light", lambda *given: light)
+    for room in (train, supervision):
+        monkeypatch.setattr(room, "meets", lambda sampler, rays: torch.zeros(len(rays), dtype=torch.bool))
+    updated = update_field(capture, OLD_FIELD, change, QUICK)
+    assert updated.light is light and updated.shading[0] is light and updated.helper is None
+    assert "nothing could be learnt" in updated.why_stopped

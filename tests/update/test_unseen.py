@@ -8,10 +8,10 @@ import torch
 from refield.field.radiance import Field, HashField, HashFieldConfig
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays
-from refield.update.composite import Origin, UpdatedField
-from refield.update.config import UpdateConfig
-from refield.update.fit_helper import HelperTraining, Lit
+from refield.update.composite import UpdatedField
+from refield.update.fit_helper import HelperConfig, HelperTraining, Lit
 from refield.update.frozen import Segments
+from refield.update.learnt import Learnt, Origin
 from refield.update.recall import without
 from refield.update.region import move_out
 from refield.update.supervision import Lessons
@@ -58,7 +58,7 @@ def test_hidden_cells_are_not_shown_unless_something_new_answers_for_them() -> N
     cells = sight_of(field, frames(), [BOX]).hidden
     x = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.2]])
     change = change_of(moved(Ball(at(0.0, 0.0, 0.0), 0.1), at(2.0, 0.0, 0.0)))
-    updated = UpdatedField(field, change, helper=BallWorld((Ball(at(0.0, 0.0, 0.0), 0.1),), floor=False))
+    updated = UpdatedField(field, change, Learnt(BallWorld((Ball(at(0.0, 0.0, 0.0), 0.1),), floor=False)))
     assert updated.sampler.occupied(x).all()
     shown = updated.unshown(cells).sampler.occupied(x)
     assert shown.tolist() == [True, False] and updated.sampler.occupied(x).all()
@@ -75,16 +75,16 @@ def test_hidden_cells_are_not_shown_unless_something_new_answers_for_them() -> N
 def test_a_helper_is_told_what_was_looked_through() -> None:
     change = change_of(moved(SHELL, at(2.0, 0.0, 0.0)))
     wide = move_out(change, 1.5)
-    frozen = UpdatedField(BallWorld((SHELL,), floor=False), change, region=wide)
+    frozen = UpdatedField(BallWorld((SHELL,), floor=False), change, Learnt(region=wide))
     helper = HashField(HashFieldConfig(2, 8, 16, 8, 8, 3), wide.sampler(0.05))
     zeros = torch.zeros
     rays = Rays(zeros(0, 3), zeros(0, 3))
     nothing = Lit(
-        Lessons(rays, zeros(0, 3), *(zeros(0, dtype=torch.long) for _ in range(2))),
+        Lessons(rays, zeros(0, 3), *(zeros(0, dtype=torch.long) for _ in range(2)), zeros(0, dtype=torch.bool)),
         Segments(zeros(0), zeros(0), zeros(0, 3), zeros(1, dtype=torch.long)),
     )
     sight = sight_of(frozen.pretrained, frames(), [BOX])
     x = torch.tensor([[0.7, 0.0, 0.0], [0.0, 0.0, 0.48]])  # beside the ball; at its surface
-    for known, tolls in ((sight, [UpdateConfig.emptiness, 0.0]), (None, [0.0, 0.0])):
-        run = HelperTraining(helper, frozen, nothing, nothing, nothing, UpdateConfig(), (), known)
+    for known, tolls in ((sight, [HelperConfig.emptiness, 0.0]), (None, [0.0, 0.0])):
+        run = HelperTraining(helper, frozen, nothing, nothing, nothing, HelperConfig(), torch.Generator(), (), known)
         assert run.misplaced[helper.sampler.cells(x)].tolist() == pytest.approx(tolls)

@@ -15,6 +15,7 @@ from refield.scene.change import ObjectChange, OccupancyGrid
 from refield.scene.inside import spans
 from refield.scene.pose import transform
 from refield.update.composite import UpdatedField
+from refield.update.learnt import Learnt
 from refield.update.light import Relighting
 from tests.update.test_composite import BESIDE, NEW, NEW_POSE, OLD, around
 from tests.update.worlds import SPACE, STEP, Ball, BallWorld, at, change_of, grid_of, moved, views
@@ -41,7 +42,7 @@ def once(base: HashField) -> UpdatedField:
     shading = light_on((-0.8, -0.1, 0.0), (-0.2, 0.5, 0.5))
     eyes = torch.tensor([[2.0, 0.0, 1.0], [0.0, 2.0, 1.0], [-2.0, 0.5, 1.0]])
     change = change_of(moved(OLD, NEW_POSE))
-    field = UpdatedField(base, change, BallWorld(()), light=light, shading=(shading,), eyes=eyes)
+    field = UpdatedField(base, change, Learnt(BallWorld(()), light=light, shading=(shading,)), eyes=eyes)
     cells = base.sampler.cells_in(torch.tensor([[0.1, 0.5, 0.0], [0.4, 0.9, 0.6]]))
     return field.unshown(cells)
 
@@ -103,7 +104,7 @@ def test_chunks_do_not_matter() -> None:
 def test_rays_that_meet_nothing_that_changed_show_the_hash_field_bit_for_bit() -> None:
     base = slab()
     light = light_on((-1.2, -1.0, -0.3), (-0.4, 0.0, 0.4))
-    field = UpdatedField(base, change_of(moved(OLD, NEW_POSE)), light=light)
+    field = UpdatedField(base, change_of(moved(OLD, NEW_POSE)), Learnt(light=light))
     rays = views(64)
     was, now = render_many(base, rays), render_many(field, rays)
     (there,), (here,) = [o.grid for o in field.change.objects], [o.grid_now for o in field.change.objects]

@@ -10,11 +10,10 @@ from torch import Tensor
 from refield.field.photos import Since
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import SceneChange
-from refield.update.config import UpdateConfig
-from refield.update.supervision import Places, places_of, united
+from refield.update.supervision import Places, SuperviseConfig, places_of, united
 from refield.vision.pixels import dilate
 
-SHADOW = UpdateConfig.shadow
+SHADOW = SuperviseConfig.shadow
 """Reach of the objects' shadows in image widths, as in the update (§10.1.3)"""
 
 

@@ -1,4 +1,4 @@
-"""The one training loop: photos with poses → a field (§10.1.1), and what the update shares of it."""
+"""The one training loop of our fields: photos with poses → a field (§10.1.1)."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from refield.field.photos import UNCHANGED, Photos, Since
 from refield.field.placing import COLOUR_IN, DIRECTED, around, new_field, opened, place_contraction, stand_outside
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.sampling import STOP
+from refield.field.schedule import at_plateau, rate_factor
 from refield.scene.capture import Capture, check_capture
 from refield.scene.errors import InputError, expect
 
@@ -391,15 +392,3 @@ def seconds_left(config: FitConfig, step: int, seconds: float) -> float:
     """Until a fit ends that has done so many steps in so many seconds, if it goes on like that."""
     by_steps = seconds * (config.steps / max(step, 1) - 1)
     return max(min(by_steps, (config.max_seconds or math.inf) - seconds), 0.0)
-
-
-def at_plateau(looks: list[float], config: FitConfig) -> bool:
-    """Whether the last looks at the held-out pixels, dB, have gained nothing."""
-    n = config.patience
-    return len(looks) > n and max(looks[-n:]) < max(looks[:-n]) + config.least_gain
-
-
-def rate_factor(progress: float) -> float:
-    """Learning rate over the run: warm for the first half, then down to 1/30 along a cosine in the logarithm."""
-    late = max(0.0, (progress - 0.5) / 0.5)
-    return 30 ** -(0.5 - 0.5 * math.cos(math.pi * min(late, 1.0)))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from refield.field.descent import MOST_SKIPPED, NonFiniteError
-from refield.field.fit import FitProgress, Fitted, ProgressCallback, rate_factor
+from refield.field.fit import FitProgress, Fitted, ProgressCallback
 from refield.field.interlevel import interlevel_loss
 from refield.field.kernels.reference import Batch, Stepped, compared
 from refield.field.losses import colour_loss, distortion_loss, scale_gradients
@@ -22,6 +22,7 @@ from refield.field.photos import UNCHANGED, Photos
 from refield.field.placing import DIRECTED, place_contraction
 from refield.field.proposal import Histogram, annealing
 from refield.field.sampling import OccupancySampler
+from refield.field.schedule import rate_factor
 from refield.field.volrend import Samples, accumulate_rgb, weights
 from refield.scene.capture import Capture, Rays
 

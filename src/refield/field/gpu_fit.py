@@ -16,9 +16,7 @@ from refield.field.fit import (
     FitProgress,
     ProgressCallback,
     StepCallback,
-    at_plateau,
     progress_of,
-    rate_factor,
     seconds_left,
 )
 from refield.field.graphed import Descent, DevicePixels, GraphedStep
@@ -28,6 +26,7 @@ from refield.field.photos import Photos
 from refield.field.placing import stand_outside
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP
+from refield.field.schedule import at_plateau, rate_factor
 from refield.scene.capture import Rays
 
 _BATCH = 32  # times the samples of a step on a CPU: fewer would leave most of the chip idle

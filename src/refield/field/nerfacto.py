@@ -125,14 +125,19 @@ class NerfactoField(nn.Module):
         return lambda x: self._sigma(network(self._contracted(x))[:, 0])
 
     def propose(
-        self, rays: Rays, jitter: bool = False, anneal: float = 1.0, densities: tuple[Density, ...] | None = None
+        self,
+        rays: Rays,
+        jitter: bool = False,
+        anneal: float = 1.0,
+        densities: tuple[Density, ...] | None = None,
+        draw: torch.Generator | None = None,
     ) -> tuple[tuple[Histogram, ...], Tensor]:
         """The proposals' histograms of N rays, and the edges (N, K + 1) in s at which to ask the field.
 
         ``densities`` may ask the proposal networks elsewhere than where a sample lies (Eq. 16).
         """
         counts = (*(p.samples for p in self.config.proposals), self.config.samples)
-        return propose(rays, densities or self.densities, Plan(self.span, counts, anneal), jitter)
+        return propose(rays, densities or self.densities, Plan(self.span, counts, anneal), jitter, draw)
 
     def samples(self, rays: Rays, jitter: bool = False, without: Inside | None = None) -> Samples:
         """Where to evaluate the field along rays: where the proposal networks expect something to be seen.

@@ -43,11 +43,13 @@ class OccupancyTrainer:
         doubt: float = 2 * _OPACITY,
         outside: bool = True,
         beside: Tensor | None = None,
+        draw: torch.Generator | None = None,
     ) -> None:
         """``allowed`` (R**3,) bool: cells that may hold something at all; all by default. ``doubt``: the opacity that
         cells begin with, except where cameras stand. ``outside``: whether they stand around the core. ``beside``
-        (R**3,) bool: cells right beside one of them."""
-        self.model, self.cull_from = model, cull_from
+        (R**3,) bool: cells right beside one of them. ``draw``: what is drawn at random is drawn of it; by default of
+        torch's own."""
+        self.model, self.cull_from, self.draw = model, cull_from, draw
         device = model.sampler.grid.device
         cells = model.sampler.resolution**3
         self.allowed = torch.ones(cells, dtype=torch.bool, device=device) if allowed is None else allowed
@@ -90,24 +92,28 @@ class OccupancyTrainer:
         if len(self.open) == 0:
             return
         part = _PROBED_AT_FIRST if step < 4 * EVERY else _PROBED
-        cells = self.open[torch.randint(len(self.open), (len(self.open) // part + 1,), device=self.open.device)]
+        cells = self._some_open(len(self.open) // part + 1)
         self.state[cells, 0] = self.state[cells, 0] * DECAY  # cells may be drawn twice
         kernels.scatter_max(self._probe(cells), cells, self.state[:, 0])
         if step >= self.cull_from:
             # a few hidden cells get another chance, since geometry still changes
-            again = self.open[torch.randint(len(self.open), (len(self.open) // 100,), device=self.open.device)]
+            again = self._some_open(len(self.open) // 100)
             self.state[again, 1] = self.state[again, 1].clamp_min(4 * _WEIGHT)
         self.sharp = step >= 4 * self.cull_from
         grid = self._kept(_WEIGHT if step >= self.cull_from else -1.0, self.sharp)
         self._show(grid, cells)
         self.rounds += 1
 
+    def _some_open(self, count: int) -> Tensor:
+        """So many of the open cells, drawn at random; one may be drawn twice."""
+        return self.open[torch.randint(len(self.open), (count,), device=self.open.device, generator=self.draw)]
+
     def _probe(self, cells: Tensor) -> Tensor:
         """Opacity of a sample at a random point of each cell, (K,) -> (K,)."""
         r, model = self.model.sampler.resolution, self.model
         corner = torch.stack([cells // (r * r), cells // r % r, cells % r], -1)
         with torch.no_grad():
-            unit = (corner + torch.rand(len(cells), 3, device=cells.device)) / r
+            unit = (corner + torch.rand(len(cells), 3, device=cells.device, generator=self.draw)) / r
             sigma = model.sigma(kernels.hash_density(unit, model.density_net))
         return -torch.expm1(-sigma * self.state[cells, 2])
 

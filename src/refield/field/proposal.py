@@ -84,34 +84,48 @@ class Plan:
 
 
 def propose(
-    rays: Rays, densities: Sequence[Density], plan: Plan, jitter: bool = False
+    rays: Rays,
+    densities: Sequence[Density],
+    plan: Plan,
+    jitter: bool = False,
+    draw: torch.Generator | None = None,
 ) -> tuple[tuple[Histogram, ...], Tensor]:
     """What each proposal network says of N rays, and the edges (N, K + 1) in s at which the field is to be asked.
 
-    Gradients reach the densities through the histograms' weights, never the edges.
+    Gradients reach the densities through the histograms' weights, never the edges. Jitter is drawn of ``draw``, by
+    default of torch's own generator.
     """
     told: list[Histogram] = []
-    edges = even_edges(len(rays), plan.counts[0], jitter, rays.origins.device)
+    edges = even_edges(len(rays), plan.counts[0], jitter, rays.origins.device, draw)
     for density, following in zip(densities, plan.counts[1:], strict=True):
         samples = plan.span.samples(edges)
         x, _ = samples.positions(rays)
         w = weights(density(x), samples).reshape(len(rays), edges.shape[1] - 1)
         told.append(Histogram(edges, w))
-        edges = resampled(told[-1], following, jitter, plan.anneal, plan.padding)
+        edges = resampled(told[-1], following, jitter, plan.anneal, plan.padding, draw)
     return tuple(told), edges
 
 
-def even_edges(rays: int, count: int, jitter: bool, device: torch.device | None = None) -> Tensor:
+def even_edges(
+    rays: int, count: int, jitter: bool, device: torch.device | None = None, draw: torch.Generator | None = None
+) -> Tensor:
     """Edges (N, count + 1) of equal intervals of [0, 1]; jittered, each ray's lie up to half an interval off."""
     edges = torch.linspace(0, 1, count + 1, device=device)
     if not jitter:
         return edges.expand(rays, -1).contiguous()
     middle = (edges[1:] + edges[:-1]) / 2
     lower = torch.cat([edges[:1], middle])[:-1]
-    return _closed(lower + (middle - lower) * torch.rand(rays, 1, device=device))
+    return _closed(lower + (middle - lower) * torch.rand(rays, 1, device=device, generator=draw))
 
 
-def resampled(told: Histogram, count: int, jitter: bool, anneal: float = 1.0, padding: float = 0.01) -> Tensor:
+def resampled(
+    told: Histogram,
+    count: int,
+    jitter: bool,
+    anneal: float = 1.0,
+    padding: float = 0.01,
+    draw: torch.Generator | None = None,
+) -> Tensor:
     """Edges (N, count + 1) in s, ascending, at equal steps of the histogram's cumulated weight; without gradient.
 
     One shift a ray jitters them all, so that no two come to lie closer than the histogram says.
@@ -119,7 +133,7 @@ def resampled(told: Histogram, count: int, jitter: bool, anneal: float = 1.0, pa
     w = told.weights.detach().clamp_min(0) ** anneal + padding
     summed = w.cumsum(-1)
     cdf = torch.cat([torch.zeros_like(w[:, :1]), summed / summed[:, -1:]], -1)
-    shift = torch.rand(len(w), 1, device=w.device) if jitter else w.new_full((len(w), 1), 0.5)
+    shift = torch.rand(len(w), 1, device=w.device, generator=draw) if jitter else w.new_full((len(w), 1), 0.5)
     u = (torch.arange(count, device=w.device) + shift) / count
     after = torch.searchsorted(cdf, u, right=True).clamp(1, w.shape[1])
     c0, c1 = cdf.gather(1, after - 1), cdf.gather(1, after)

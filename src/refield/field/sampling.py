@@ -115,9 +115,9 @@ class OccupancySampler:
         # the contraction makes cells outside of the core as much larger as their distance squared
         return 4 * self.contraction.radius / self.resolution * reach.clamp_min(1.0) ** 2
 
-    def points_in(self, cells: Tensor, jitter: bool = True) -> Tensor:
-        """A world point in each cell: random, or its centre. (K,) -> (K, 3)."""
-        offset = torch.rand(len(cells), 3, device=cells.device) if jitter else None
+    def points_in(self, cells: Tensor, jitter: bool = True, draw: torch.Generator | None = None) -> Tensor:
+        """A world point in each cell: random, of ``draw`` if given, or its centre. (K,) -> (K, 3)."""
+        offset = torch.rand(len(cells), 3, device=cells.device, generator=draw) if jitter else None
         return self.contraction.inverse(self._contracted(cells, offset))
 
     def _contracted(self, cells: Tensor, offset: Tensor | None) -> Tensor:
@@ -134,8 +134,8 @@ class OccupancySampler:
     ) -> OccupancySampler:
         """The same sampler with the cells that touch the world boxes (2, 3) looked up anew in ``density``.
 
-        A cell is occupied if at one of ``probes`` points a sample would have an opacity above ``threshold``. Of its
-        parts nothing is known any more.
+        A cell is occupied if at one of ``probes`` points a sample would have an opacity above ``threshold``; the points
+        are always the same. Of its parts nothing is known any more.
         """
         grid, fine = self.grid.clone(), None if self.fine is None else self.fine.clone()
         for box in boxes:
@@ -147,10 +147,10 @@ class OccupancySampler:
 
     def _probe(self, density: Callable[[Tensor], Tensor], cells: Tensor, threshold: float, probes: int) -> Tensor:
         found = torch.zeros(len(cells), dtype=torch.bool, device=cells.device)
-        length = self.step_at(cells)
+        length, draw = self.step_at(cells), torch.Generator(cells.device).manual_seed(0)
         with torch.no_grad():
             for i in range(probes):
-                x = self.points_in(cells, jitter=i > 0)
+                x = self.points_in(cells, jitter=i > 0, draw=draw)
                 found |= density(x) * length > -torch.log1p(torch.tensor(-threshold))
         return found.to(self.grid.dtype)
 

@@ -19,7 +19,11 @@ _TRUST, _BLUNDER = 3.0, 2.5e-3
 
 
 def as_remembered(
-    cut: UpdatedField, sparse: Lessons, changed: Sequence[np.ndarray], recalled: Sequence[np.ndarray]
+    cut: UpdatedField,
+    sparse: Lessons,
+    changed: Sequence[np.ndarray],
+    recalled: Sequence[np.ndarray],
+    draw: torch.Generator,
 ) -> bool:
     """Whether the new photos show what earlier visits say is there, about as well as what did not change at all.
 
@@ -27,7 +31,7 @@ def as_remembered(
     `recalled_pixels`, (H, W) bool each.
     """
     known, still = sparse.within(recalled), ~sparse.within(changed)
-    told, same = (_error(cut, sparse, which) for which in (known, still))
+    told, same = (_error(cut, sparse, which, draw) for which in (known, still))
     return told < _TRUST * same + _BLUNDER
 
 
@@ -43,8 +47,8 @@ def recalled_pixels(cut: UpdatedField, frame: Frame) -> np.ndarray:
     return silhouette(known, frame) & ~silhouette(other, frame)
 
 
-def _error(field: UpdatedField, seen: Lessons, which: torch.Tensor) -> float:
+def _error(field: UpdatedField, seen: Lessons, which: torch.Tensor, draw: torch.Generator) -> float:
     """Mean squared error of some of the pixels; 0 if there are none."""
     rows = which.nonzero()[:, 0]
-    some = seen[rows[torch.randperm(len(rows))[:_PIXELS]]]
+    some = seen[rows[torch.randperm(len(rows), generator=draw)[:_PIXELS]]]
     return float((render_many(field, some.rays).rgb - some.rgb).square().mean()) if len(rows) else 0.0

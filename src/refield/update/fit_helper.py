@@ -12,14 +12,13 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.descent import NonFiniteError, TableAdam
-from refield.field.fit import rate_factor
 from refield.field.kernels.reference import Aim, Batch, Fixed, Unwanted
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP
+from refield.field.schedule import at_plateau, rate_factor
 from refield.field.volrend import Samples, accumulate_rgb
 from refield.scene.capture import Rays
 from refield.update.composite import UpdatedField
-from refield.update.config import UpdateConfig
 from refield.update.frozen import Segments, Woven, weave
 from refield.update.ground import Foothold
 from refield.update.helper import HelperOccupancy, emptiness, without_directions
@@ -28,6 +27,40 @@ from refield.update.supervision import Lessons
 from refield.update.unseen import Sight
 
 _CHUNK = 16384  # rays
+_RAYS = 1024, 8192  # of a step, at least and at most
+_PER_RAY = 0.5  # samples of a ray, at least, when rays are counted out for a step
+
+
+@dataclass(frozen=True)
+class HelperConfig:
+    """How the helper is trained."""
+
+    steps: int = 200
+    """of gradient descent"""
+    max_seconds: float = 20.0
+    """for all of the steps; the learning rate follows whichever of steps and seconds is further on"""
+    samples: int = 8192
+    """of the helper in a step"""
+    sparse_share: float | None = 0.5
+    """of each batch's rays drawn from the new photos; None: all pixels alike, old and new, as the paper draws them"""
+    directions: bool = False
+    """let its colours depend on the direction, as the paper's do; what few photos say of that does not hold between
+    them"""
+    rate: float = 2e-2
+    """Adam's learning rate, held for the first half, then brought down to a thirtieth"""
+    distortion: float = 1e-2
+    """weight of the distortion loss"""
+    gradient_unit: float = 1.0
+    """gradient scaling reaches 1 at this many core radii of the old field from the camera"""  # §10.1
+    emptiness: float = 5e-2
+    """weight of the colour that comes from where nothing can be: deep inside what left, where nothing was before and,
+    half as much, beneath the ground that it stood on and above that in its rim and right beside it"""
+    check_every: int = 25
+    """steps between looks at the held-out pixels"""
+    patience: int = 3
+    """looks without ``least_gain`` after which training stops"""
+    least_gain: float = 0.03
+    """dB"""
 
 
 @dataclass(frozen=True)
@@ -59,19 +92,20 @@ class HelperTraining:
         sparse: Lit,
         old: Lit,
         judge: Lit,
-        config: UpdateConfig,
+        config: HelperConfig,
+        draw: torch.Generator,
         ground: Sequence[Foothold] = (),
         sight: Sight | None = None,
     ) -> None:
-        self.helper, self.config, self.frozen = helper, config, frozen
+        self.helper, self.config, self.frozen, self.draw = helper, config, frozen, draw
         lessons, fixed = sparse.lessons.followed_by(old.lessons), Segments.joined([sparse.fixed, old.fixed])
         self.taught, self.new_rays, self.judge = Lit(lessons, fixed), len(sparse.lessons), judge
         added = tuple(o.grid for o in frozen.change.objects if o.kind == "added")
         taken = Region(added + frozen.bare.grids)
         self.misplaced = config.emptiness * emptiness(frozen.change, helper.sampler, taken, ground, sight)
-        self.occupancy = HelperOccupancy(helper)
+        self.occupancy = HelperOccupancy(helper, draw)
         self.adam = TableAdam(helper)
-        self.rays_per_step, self.steps_done = 1024, 0
+        self.rays_per_step, self.steps_done = _RAYS[0], 0
         self.why_stopped = "all steps done"
 
     def run(self, on_progress: Callable[[UpdateProgress], None] | None = None) -> list[float]:
@@ -102,8 +136,7 @@ class HelperTraining:
                     best = {k: v.detach().clone() for k, v in self.helper.state_dict().items()}
                 if on_progress:
                     on_progress(UpdateProgress(step + 1, c.steps, looks[-1], time.perf_counter() - began))
-                n = c.patience
-                if len(looks) > n and max(looks[-n:]) < max(looks[:-n]) + c.least_gain:
+                if at_plateau(looks, c):
                     self.why_stopped = "held-out pixels stopped gaining"
                     break
         if looks and self.steps_done % c.check_every and self.psnr(self.judge) >= max(looks):
@@ -147,15 +180,19 @@ class HelperTraining:
     def _drawn(self) -> Tensor:
         """Rays of a step, (N,) int64: the new photos' share of them first."""
         n, new, old = self.rays_per_step, self.new_rays, len(self.taught.lessons) - self.new_rays
-        n_new = n if not old else round(n * self.config.sparse_share) if new else 0
-        return torch.cat([torch.randint(max(new, 1), (n_new,)), new + torch.randint(max(old, 1), (n - n_new,))])
+        share = new / max(new + old, 1) if self.config.sparse_share is None else self.config.sparse_share
+        n_new = n if not old else round(n * share) if new else 0
+        shares = ((new, n_new), (old, n - n_new))
+        of_new, of_old = (torch.randint(max(most, 1), (k,), generator=self.draw) for most, k in shares)
+        return torch.cat([of_new, new + of_old])
 
     def _step(self, step: int, rate: float) -> None:
         chosen, helper, c = self._drawn(), self.helper, self.config
         n, lessons, fixed = len(chosen), self.taught.lessons, self.taught.fixed
         rays, sampler = lessons.rays[chosen], helper.sampler
         # what stays transparent is shown noise, so that only opaque surfaces explain the photos
-        batch = Batch((rays.origins, rays.directions, torch.rand(n)), lessons.rgb[chosen], torch.rand(n, 3))
+        jitter, shown = (torch.rand(*shape, generator=self.draw) for shape in ((n,), (n, 3)))
+        batch = Batch((rays.origins, rays.directions, jitter), lessons.rgb[chosen], shown)
         done = kernels.woven_step(
             batch,
             Fixed(fixed.t_mid, fixed.optical_depth, fixed.rgb, fixed.offsets, chosen),
@@ -167,9 +204,10 @@ class HelperTraining:
             Aim(c.distortion, c.gradient_unit * self.frozen.sampler.contraction.radius, STOP),
             self.adam.grads,
         )
-        without_directions(helper, self.adam.grads)
+        if not c.directions:
+            without_directions(helper, self.adam.grads)
         if not self.adam.step(rate, done.loss):
             return
         self.occupancy.observe(step, done.cells, done.weights, done.sigmas)
-        per_ray = max(len(done.cells) / n, 0.5)
-        self.rays_per_step = int(min(max(c.samples / per_ray, 1024), 8192))
+        per_ray = max(len(done.cells) / n, _PER_RAY)
+        self.rays_per_step = int(min(max(c.samples / per_ray, _RAYS[0]), _RAYS[1]))

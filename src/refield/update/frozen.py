@@ -21,8 +21,18 @@ from refield.field.render import visible_samples
 from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
+from refield.update.composite import UpdatedField
+from refield.update.ground import Foothold
 
 _CHUNK = 16384  # rays
+
+
+@dataclass(frozen=True)
+class FreezeConfig:
+    """What of the old field is shown, beside and beneath what is learnt."""
+
+    unseen: bool = True
+    """nothing that no old photo saw, and nothing new where old photos looked through; the paper has all of it shown"""
 
 
 @dataclass(frozen=True)
@@ -68,6 +78,19 @@ class Segments:
     def ray_ids(self) -> Tensor:
         """(K,) int64"""
         return torch.repeat_interleave(torch.arange(len(self.offsets) - 1), self.offsets.diff())
+
+
+def fixed_along(frozen: UpdatedField, region: OccupancySampler, rays: Rays, ground: Sequence[Foothold]) -> Segments:
+    """What is fixed along rays. Nothing beyond the ground that an object stood on: nobody has ever looked through it,
+    and where the old field's inside shows as through a mist, a helper needs not become solid."""
+    fixed = composite_once(frozen, region, rays)
+    met = torch.full((len(rays),), torch.inf)  # where a textured plane hides what is beyond it, and has to stay
+    for plane in frozen.region.planes:
+        met = torch.where(plane.hit(rays), torch.minimum(met, plane.met(rays) - plane.depth), met)
+    for foothold in ground:
+        entered = foothold.entered(rays)
+        fixed = fixed.before(torch.where(met < entered, torch.inf, entered))
+    return fixed
 
 
 def composite_once(field: Field, region: OccupancySampler, rays: Rays) -> Segments:

@@ -12,12 +12,55 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from refield.field.render import render_many
+from refield.field.warp import crosses
 from refield.scene.capture import Rays
 from refield.scene.change import OccupancyGrid
 from refield.scene.planes import Plane, rough_planes
+from refield.update.cut import Known
+from refield.update.region import Region
+from refield.update.supervision import Lessons
 
 _POINTS = 6000  # that planes are looked for among
 _RIM = 0.12  # of an object's mean side
+_TOUCHED = 0.02  # the quantile of its heights above a plane, of what it touches
+_RAYS = 12_000  # that planes are looked for along
+
+
+@dataclass(frozen=True)
+class GroundConfig:
+    """What is known of the ground that objects stood on; the paper learns it as anything else."""
+
+    footholds: bool = True
+    """nothing is beyond the planes that objects stood on or leant against, and haze over them is dear"""
+    textured: bool = True
+    """these planes get the texture that the new photos show, by least squares; else the helper learns them"""
+    reach: float = 2.0
+    """within each object's grid at its old and its new place, its box this many times as large (the paper: 2 to 3).
+    When the object moves on, what lies within `composite.DILATION` times its box is forgotten."""
+
+
+def ground_of(
+    known: Known, old: Lessons, wide: Region, eyes: Tensor, resolved: float, draw: torch.Generator
+) -> list[Foothold]:
+    """What stood on planes where something is to be learnt: the objects that left, and what is left to learn of places
+    that earlier visits know. The planes are looked for along the rays of the old photos that teach, else along those of
+    the new ones that pass nearby.
+
+    Args:
+        wide: where something is to be learnt.
+        eyes: (C, 3) old cameras' centres.
+        resolved: how exact the old field's surfaces are, world units.
+    """
+    cut, shown, rays = known.cut, known.cut.pretrained, old.rays
+    if len(rays) == 0:
+        near = crosses(known.sparse.rays, wide.around)
+        shown, rays = cut, known.sparse.rays[near.nonzero()[:, 0]]
+    rays = rays[torch.randperm(len(rays), generator=draw)[:_RAYS]]
+    points = rays.origins + rays.directions * render_many(shown, rays).depth[:, None]
+    planes = planes_around(points, wide.box, eyes, resolved, draw)
+    left = [o.grid for o in cut.to_learn.objects if o.kind != "added"]
+    return footholds(left + list(cut.earlier.unknown.grids), planes)
 
 
 def rim(grid: OccupancyGrid) -> float:
@@ -33,7 +76,7 @@ def footholds(grids: Sequence[OccupancyGrid], planes: Sequence[Plane]) -> list[F
         if not len(occupied):
             continue
         reach = rim(grid)
-        touched = (p for p in planes if abs(float(np.quantile(p.height(occupied), 0.02))) < reach)
+        touched = (p for p in planes if abs(float(np.quantile(p.height(occupied), _TOUCHED))) < reach)
         found += [Foothold(p, grid, reach) for p in touched]
     return found
 
@@ -65,7 +108,7 @@ class Foothold:
         return torch.where(met, t, torch.inf)
 
 
-def planes_around(points: Tensor, box: Tensor, eyes: Tensor, resolved: float) -> list[Plane]:
+def planes_around(points: Tensor, box: Tensor, eyes: Tensor, resolved: float, draw: torch.Generator) -> list[Plane]:
     """Planes among surface points (N, 3) in and around a world box (2, 3).
 
     Args:
@@ -73,5 +116,5 @@ def planes_around(points: Tensor, box: Tensor, eyes: Tensor, resolved: float) ->
         resolved: how exact the points are, world units.
     """
     near = points[((points - box.mean(0)).abs() < (box[1] - box[0]).max()).all(-1)]
-    some = near[torch.randperm(len(near))[:_POINTS]].double().numpy()
+    some = near[torch.randperm(len(near), generator=draw)[:_POINTS]].double().numpy()
     return rough_planes(some, eyes.double().numpy(), resolved)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -19,24 +20,32 @@ from refield.update.ground import Foothold, rim
 from refield.update.region import Region, grown
 from refield.update.unseen import Sight
 
+_SHAPE = HashFieldConfig(levels=8, coarsest=16, log2_table=15)  # of a region, a small part of a scene
+_FINE = 1.5  # pixels of the nearest new photo, the side of a finest cell; so many of these along the space at least and
+_FINEST = 64, 2048  # at most
 _OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
+_PROBES = 4  # points of a cell that are asked for it
 _WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
 _RIM = 0.5  # as empty as this is the rim of what stood on a plane, and everything beneath the plane
 _BESIDE = 1.5  # cells of the old field; so far around an object that left its fitted surface may be taken for something
 _BAND = 2.5  # cells above and beneath what an object stood on over which it becomes so empty
 
 
-def new_helper(region: OccupancySampler, frames: tuple[Frame, ...], seed: int) -> HashField:
+def new_helper(
+    region: OccupancySampler, frames: tuple[Frame, ...], seed: int, *, directions: bool = False
+) -> HashField:
     """A fresh helper that looks everywhere in ``region``; its finest cells are 1.5 pixels of the nearest photo.
 
-    Its colours do not depend on direction: what a few photos say about that does not hold between them.
+    Its colours do not depend on the direction unless ``directions``: what a few photos say about that does not hold
+    between them.
     """
     space = region.contraction
     pixel = min(float((f.centre.float() - space.centre).norm()) / max(f.camera.fx, f.camera.fy) for f in frames)
-    finest = int(min(max(4 * space.radius / (1.5 * pixel), 64), 2048))
-    helper = HashField(HashFieldConfig(levels=8, coarsest=16, finest=finest, log2_table=15), region, seed)
-    with torch.no_grad():
-        without_directions(helper, [helper.encoding.tables, *helper.networks])
+    finest = int(min(max(4 * space.radius / (_FINE * pixel), _FINEST[0]), _FINEST[1]))
+    helper = HashField(replace(_SHAPE, finest=finest), region, seed)
+    if not directions:
+        with torch.no_grad():
+            without_directions(helper, [helper.encoding.tables, *helper.networks])
     return helper
 
 
@@ -114,10 +123,10 @@ def _band(foothold: Foothold, cell: float) -> float:
 class HelperOccupancy:
     """The helper's occupancy grid in training: the engine's, never outside the region."""
 
-    def __init__(self, helper: HashField, cull_from: int = 64) -> None:
-        self.helper = helper
+    def __init__(self, helper: HashField, draw: torch.Generator, cull_from: int = 64) -> None:
+        self.helper, self.draw = helper, draw
         self.allowed = helper.sampler.grid.clone()
-        self.trainer = OccupancyTrainer(helper, cull_from, self.allowed.reshape(-1) > 0, doubt=0.0)
+        self.trainer = OccupancyTrainer(helper, cull_from, self.allowed.reshape(-1) > 0, doubt=0.0, draw=draw)
 
     def observe(self, step: int, cells: Tensor, w: Tensor, sigmas: Tensor) -> None:
         """After each step: samples' cells (S,), weights (S,) and densities (S,)."""
@@ -130,7 +139,8 @@ class HelperOccupancy:
         s = self.helper.sampler
         self.helper.train()  # ask everywhere, not only where training looked last
         with torch.no_grad():
-            sigma = torch.stack([self.helper.density(s.points_in(cells, jitter=i > 0)) for i in range(4)]).amax(0)
+            points = (s.points_in(cells, jitter=i > 0, draw=self.draw) for i in range(_PROBES))
+            sigma = torch.stack([self.helper.density(x) for x in points]).amax(0)
         opaque = torch.zeros_like(self.allowed)
         opaque.view(-1)[cells] = (-torch.expm1(-sigma * s.step) > _OPACITY).to(torch.uint8)
         seen = (self.trainer.weight > _WEIGHT).reshape(1, 1, *self.allowed.shape).float()

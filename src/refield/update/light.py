@@ -127,6 +127,8 @@ def _relight(x: _Array, aabb: _Array, log_gain: _Array, rgb: _Array) -> None:
 _PATCH_FOLDS = 4
 _COARSER = (4, 2, 1)  # lattice spacings of the pyramid, in the finest
 _HOLD = 2.0  # how many pixels' worth of evidence each level grants to the coarser one
+_LESS, _SOME = 0.9, 1e-6  # so much less is a squared error that a factor explains, of one that is any at all
+_NODES = 2, 96  # cells of a lattice along a side, at least and at most
 _MOST = 3.0  # factors are held within [1 / this, this]
 
 
@@ -174,7 +176,7 @@ def _confirmed(seen: Sightings, box: Tensor, spacing: float) -> Tensor:
         after = (left_out.photo - (left_out.rendered * factor).clamp(0, 1)).square().sum(-1)
         errors.append(_scatter(torch.stack([before, after], -1), left_out.x, box, shape))
     before, after = _smoothed(sum(errors[1:], errors[0])).unbind(-1)
-    return (after < 0.9 * before) & (before > 1e-6)
+    return (after < _LESS * before) & (before > _SOME)
 
 
 def _pyramid(seen: Sightings, box: Tensor, spacing: float) -> Tensor:
@@ -192,7 +194,7 @@ def _pyramid(seen: Sightings, box: Tensor, spacing: float) -> Tensor:
 
 
 def _shape(box: Tensor, spacing: float) -> tuple[int, int, int]:
-    x, y, z = ((box[1] - box[0]) / spacing).ceil().long().clamp(2, 96).tolist()
+    x, y, z = ((box[1] - box[0]) / spacing).ceil().long().clamp(*_NODES).tolist()
     return x + 1, y + 1, z + 1
 
 

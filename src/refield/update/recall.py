@@ -16,7 +16,8 @@ from refield.field.radiance import Field
 from refield.field.warp import Move, inside_box, outline
 from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.pose import transform
-from refield.update.composite import DILATION, Earlier, Origin, UpdatedField, layers_of, some_of
+from refield.update.composite import DILATION, UpdatedField, layers_of, some_of
+from refield.update.learnt import Earlier, Origin
 from refield.update.region import Region, carved, forgotten, grown, move_out
 
 _SAME = 0.5  # of one grid's nodes that lie in the other
@@ -79,7 +80,7 @@ def without(field: Field, origin: Origin, *, departed: bool) -> Field:
         raise ValueError("the field has not had so many changes")
     if origin.layer:
         inner = without(field.pretrained, replace(origin, layer=origin.layer - 1), departed=departed)
-        return _rebuilt(field, inner)
+        return field.but(pretrained=inner)
     own = origin.index
     o = field.change.objects[own]
     moving = [k for k, q in enumerate(field.change.objects) if q.new_from_old is not None and k not in field.skipped]
@@ -93,11 +94,9 @@ def without(field: Field, origin: Origin, *, departed: bool) -> Field:
         change = replace(field.change, objects=objects)
         assert o.new_from_old is not None  # it moved
         stood = grown(o.grid.moved(o.new_from_old), _TAUGHT * field.pretrained.sampler.step)
-        untaught = Region((*field.untaught.grids, stood))
-        region = _unshaded(region, o)
-        return _rebuilt(
-            field, field.pretrained, change=change, region=region, bare=kept, shading=shading, untaught=untaught
-        )
+        learnt = replace(field.learnt, region=_unshaded(region, o), bare=kept, shading=shading)
+        taken = replace(field.taken, untaught=Region((*field.untaught.grids, stood)))
+        return field.but(change=change, learnt=learnt, taken=taken)
     skipped = field.skipped | {own}
     if len(skipped) == len(field.change.objects):
         return field.pretrained
@@ -107,28 +106,8 @@ def without(field: Field, origin: Origin, *, departed: bool) -> Field:
         earlier = replace(earlier, places=_less(earlier.places, o.grid, kept))
     else:
         region = _less(region, o.grid, kept)
-    region = _unshaded(region, o)
-    return _rebuilt(
-        field, field.pretrained, region=region, bare=kept, shading=shading, earlier=earlier, skipped=skipped
-    )
-
-
-def _rebuilt(field: UpdatedField, inner: Field, **changed: object) -> UpdatedField:
-    """The same update over another field, with other parts."""
-    parts: dict[str, object] = {
-        "change": field.change,
-        "region": field.region,
-        "light": field.light,
-        "shading": field.shading,
-        "eyes": field.eyes,
-        "bare": field.bare,
-        "earlier": field.earlier,
-        "skipped": field.skipped,
-        "untaught": field.untaught,
-    } | changed
-    change = parts.pop("change")
-    rebuilt = UpdatedField(inner, change, field.helper, **parts)  # type: ignore[arg-type]
-    return rebuilt.unshown(field.unseen)
+    learnt = replace(field.learnt, region=_unshaded(region, o), bare=kept, shading=shading)
+    return field.but(learnt=learnt, earlier=earlier, taken=replace(field.taken, skipped=skipped))
 
 
 def _brought(field: Field, place: OccupancyGrid) -> tuple[int, int] | None:

@@ -18,6 +18,8 @@ from refield.update.textured import TexturedPlane
 
 _FINER = 0.5  # length of the samples of what changed, in samples of the old field: about a pixel in place of two
 _CHUNK = 65536  # rays
+_CELLS = 64, 160  # of a region's grid along a side, at least and, for memory, at most
+_ROOM = 1.02  # how much larger than the region's box its space is
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,11 @@ class Region:
         boxes = torch.stack(self.boxes)
         return torch.stack([boxes[:, 0].amin(0), boxes[:, 1].amax(0)])
 
+    @property
+    def around(self) -> list[Tensor]:
+        """World boxes (2, 3) three times as large as its own."""
+        return [torch.stack([2 * b[0] - b[1], 2 * b[1] - b[0]]) for b in self.boxes]
+
     def contains(self, x: Tensor) -> Tensor:
         """Whether world points (..., 3) are in its grids, (...,) bool."""
         flat = x.detach().reshape(-1, 3)
@@ -54,8 +61,8 @@ class Region:
         Its cells are as wide as a sample is long, within what memory affords.
         """
         box = self.box
-        space = Contraction(box.mean(0), float((box[1] - box[0]).max()) / 2 * 1.02)
-        resolution = int(min(max(4 * space.radius / step, 64), 160))
+        space = Contraction(box.mean(0), float((box[1] - box[0]).max()) / 2 * _ROOM)
+        resolution = int(min(max(4 * space.radius / step, _CELLS[0]), _CELLS[1]))
         empty = OccupancySampler(space, torch.zeros(resolution, resolution, resolution, dtype=torch.uint8), step)
         cells = empty.cells_in(box)
         grid = empty.grid.clone()

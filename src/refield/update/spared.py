@@ -2,8 +2,8 @@
 
 Light, the light on each moved object, and what is told of the surroundings of what left and arrived (ground, helper)
 are fitted to a few photos. Where one of them shows unchanged pixels of those photos worse than the old field did, the
-update is better without it: the rest is kept. The photos that judge are those that taught: harm that shows only from
-elsewhere is not seen here. Letters: P pixels.
+update is better without it: the rest is kept. Pixels of the same photos judge that nothing was
+fitted to: harm that shows only from elsewhere is not seen here. Letters: P pixels.
 """
 
 from __future__ import annotations
@@ -16,13 +16,22 @@ from torch import Tensor
 
 from refield.field.radiance import Field
 from refield.field.render import render_many
-from refield.update.composite import SKIN, UpdatedField
+from refield.update.composite import UpdatedField
 from refield.update.region import Region, carved, grown
+from refield.update.routing import SKIN
 from refield.update.supervision import Lessons
 from refield.update.textured import TexturedPlane
 
 _PIXELS = 20_000  # of the new photos, that are asked; their errors' means are known to a few parts in a thousand
 _ROUNDED = 1 / 255**2 / 12  # squared error of a photo's own rounding to 8 bits; less is no difference
+
+
+@dataclass(frozen=True)
+class ShowConfig:
+    """What is kept of what was learnt."""
+
+    spared: bool = True
+    """leave out parts that show unchanged pixels worse than the old field did"""
 
 
 @dataclass(frozen=True)
@@ -52,7 +61,7 @@ def spared(updated: UpdatedField, new: Lessons, changed: Tensor) -> Spared:
     unchanged pixels gain the most first.
 
     Args:
-        new: pixels of the new photos.
+        new: pixels of the new photos that are kept to judge by.
         changed: (P,) bool, which of them show what arrived or left.
     """
     before, same = updated.unchanged(new.rays)
@@ -90,11 +99,13 @@ def _parts(updated: UpdatedField) -> dict[str, _Without]:
     """What may be left out, by its name in words, and how."""
     out: dict[str, _Without] = {}
     if updated.light is not None:
-        out["the light on what stood still"] = lambda field: field.but(light=None)
+        out["the light on what stood still"] = lambda field: field.but(learnt=replace(field.learnt, light=None))
     if any(light is not None for light in updated.shading):
-        out["the light on what moved"] = lambda field: field.but(shading=())
+        out["the light on what moved"] = lambda field: field.but(learnt=replace(field.learnt, shading=()))
     if updated.helper is not None or updated.region.planes:
-        out["what is beside the objects' places"] = lambda field: field.but(region=_narrow(field))
+        out["what is beside the objects' places"] = lambda field: field.but(
+            learnt=replace(field.learnt, region=_narrow(field))
+        )
     return out
 
 

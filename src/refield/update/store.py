@@ -14,7 +14,8 @@ from refield.field.radiance import Field, HashField
 from refield.field.stored import occupancy_in, sampler_out
 from refield.scene.change import SceneChange
 from refield.scene.errors import InputError
-from refield.update.composite import Earlier, Origin, UpdatedField
+from refield.update.composite import UpdatedField
+from refield.update.learnt import Earlier, Learnt, Origin
 from refield.update.light import Relighting
 from refield.update.paper.field import PaperField
 from refield.update.paper.store import paper_from_state, paper_state
@@ -94,19 +95,9 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
         base, earlier = _earlier_in(tensors, facts, pretrained)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(folder, f"does not describe an updated field ({error})", _REMEDY) from None
-    updated = UpdatedField(
-        base,
-        change,
-        helper,
-        region=region,
-        light=light,
-        shading=shading,
-        eyes=tensors.get("eyes"),
-        bare=bare,
-        sampler=sampler,
-        earlier=earlier,
-    )
-    return updated.unshown(unseen)
+    learnt = Learnt(helper, region, light, shading, bare)
+    eyes = tensors.get("eyes")
+    return UpdatedField(base, change, learnt, eyes=eyes, earlier=earlier, sampler=sampler).unshown(unseen)
 
 
 def _earlier_in(tensors: dict[str, Tensor], facts: dict[str, Any], field: Field) -> tuple[Field, Earlier]:

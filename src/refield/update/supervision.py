@@ -17,13 +17,34 @@ from torch import Tensor
 from refield.field.pixels import PixelBank
 from refield.field.radiance import Field
 from refield.field.render import render_many
+from refield.field.sampling import OccupancySampler
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid, SceneChange
+from refield.update.light import Relighting
+from refield.update.region import meets
 from refield.vision.pixels import dilate, enlarged, fit_colours
 
 _UNTOUCHED_MARGIN = 0.03  # of the width: changed areas grow by this before colours are compared across visits
 _PIXELS = 1 << 18  # of a photo; more add time and nothing to learn
 _EXPOSURE_PIXELS = 4000  # a photo: enough for six numbers
+_BETTER = 1.2, 1e-3  # an exposure is believed that makes the median error so many times less, and so much (of 1) less
+_MADE = 20  # of the old photos that an earlier visit put out of date; each takes longer to put right than to learn from
+_RING_ASKED = 1 << 20  # of the old photos' pixels, whether their rays meet the region
+_RING_RAYS = 40_000  # of the old photos; more add time and nothing to learn
+
+
+@dataclass(frozen=True)
+class SuperviseConfig:
+    """Which pixels teach."""
+
+    shadow: float = 0.01
+    """Old photos: pixels this near to an object's mask, in image widths, may hold its shadow."""  # §10.1.3
+    far: float = 0.15
+    """Old photos: pixels further away than this, in image widths, do not teach."""  # §10.1.3
+    held_out: int = 20
+    """every so-many-th pixel of the new photos is kept to judge by: nothing is fitted to it"""
+    exposure: bool = True
+    """bring the new photos to the old ones' exposure; the paper's helper has an appearance embedding"""
 
 
 @dataclass(frozen=True)
@@ -37,19 +58,32 @@ class Lessons:
     """(N,) int64: index of the new photo, or -1 for an old one"""
     place: Tensor
     """(N,) int64: the pixel's place in its photo, row by row"""
+    held: Tensor
+    """(N,) bool: kept to judge by; nothing is ever fitted to it"""
 
     def __len__(self) -> int:
         return len(self.rgb)
 
     def __getitem__(self, chosen: Tensor | slice) -> Lessons:
-        return Lessons(self.rays[chosen], self.rgb[chosen], self.photo[chosen], self.place[chosen])
+        parts = (part[chosen] for part in (self.rgb, self.photo, self.place, self.held))
+        return Lessons(self.rays[chosen], *parts)
+
+    @property
+    def taught(self) -> Lessons:
+        """Those that something may be fitted to."""
+        return self[(~self.held).nonzero()[:, 0]]
+
+    @property
+    def judging(self) -> Lessons:
+        """Those that are kept to judge by."""
+        return self[self.held.nonzero()[:, 0]]
 
     def followed_by(self, more: Lessons) -> Lessons:
         """These and then more."""
         origins = torch.cat([self.rays.origins, more.rays.origins])
         directions = torch.cat([self.rays.directions, more.rays.directions])
-        colours, photos = torch.cat([self.rgb, more.rgb]), torch.cat([self.photo, more.photo])
-        return Lessons(Rays(origins, directions), colours, photos, torch.cat([self.place, more.place]))
+        mine, others = ((s.rgb, s.photo, s.place, s.held) for s in (self, more))
+        return Lessons(Rays(origins, directions), *(torch.cat(parts) for parts in zip(mine, others)))
 
     def within(self, masks: Sequence[np.ndarray]) -> Tensor:
         """Which pixels are in the mask (H, W) bool of their new photo, (N,) bool."""
@@ -148,19 +182,31 @@ def changed_pixels(change: SceneChange, places: Places, index: int, frame: Frame
     return total
 
 
-def new_lessons(frames: Sequence[Frame], field: Field, changed: Sequence[np.ndarray]) -> Lessons:
-    """The new photos' pixels, in the old photos' exposure; of large photos some of them.
+def new_lessons(
+    frames: Sequence[Frame],
+    field: Field,
+    changed: Sequence[np.ndarray],
+    config: SuperviseConfig,
+    draw: torch.Generator,
+) -> Lessons:
+    """The new photos' pixels, in the old photos' exposure; of large photos some of them. Which are kept to judge
+    by is drawn here, once for all that follows.
 
     ``field`` is the old one with the objects cut out and moved, ``changed`` each photo's `changed_pixels`.
     """
     bank = PixelBank(frames, masks=[_thinned(f) for f in frames])
     everything = torch.arange(len(bank))
-    out = Lessons(bank.rays(everything), bank.colours(everything), bank.frame_of(everything), bank.place_of(everything))
+    held = torch.rand(len(bank), generator=draw) * max(config.held_out, 2) < 1  # something has to be left to learn from
+    out = Lessons(
+        bank.rays(everything), bank.colours(everything), bank.frame_of(everything), bank.place_of(everything), held
+    )
+    if not config.exposure:
+        return out
     wide = [dilate(mask, math.ceil(_UNTOUCHED_MARGIN * mask.shape[1])) for mask in changed]
-    still = ~out.within(wide)
+    told = ~out.within(wide) & ~held
     for i in range(len(frames)):
         mine = slice(int(bank.starts[i]), int(bank.starts[i + 1]))
-        some = still[mine].nonzero()[:, 0]
+        some = told[mine].nonzero()[:, 0]
         some = mine.start + some[:: max(1, len(some) // _EXPOSURE_PIXELS)]
         affine = exposure(out.rgb[some], render_many(field, out.rays[some]).rgb)
         out.rgb[mine] = (out.rgb[mine] * affine[0] + affine[1]).clamp(0, 1)
@@ -186,5 +232,49 @@ def exposure(photo: Tensor, rendered: Tensor) -> Tensor:
     affine = torch.from_numpy(fit_colours(photo[None].numpy(), rendered[None].numpy())).float()
     before = (photo - rendered).abs().median()
     after = (photo * affine[0] + affine[1] - rendered).abs().median()
-    worth = before > 1.2 * after + 1e-3
+    worth = before > _BETTER[0] * after + _BETTER[1]
     return affine if bool(worth) else torch.tensor([[1.0] * 3, [0.0] * 3])
+
+
+def old_lessons(
+    frames: Sequence[Frame],
+    places: Places,
+    field: Field,
+    region: OccupancySampler,
+    config: SuperviseConfig,
+    light: Relighting | None,
+    draw: torch.Generator,
+) -> Lessons:
+    """Ring pixels of the old photos whose rays meet the region, in the new light; ``field`` is the old one."""
+    asked = _asked(frames)
+    bank = PixelBank([frames[i] for i in asked])
+    chosen = [torch.zeros(0, dtype=torch.long)]
+    for k, i in enumerate(asked):
+        ring = old_ring(places, i, frames[i], config.shadow, config.far)
+        if ring is not None:
+            chosen.append(ring.reshape(-1).nonzero()[:, 0] + bank.starts[k])
+    pixels = at_most(torch.cat(chosen), _RING_ASKED, draw)
+    pixels = at_most(pixels[meets(region, bank.rays(pixels)).nonzero()[:, 0]], _RING_RAYS, draw)
+    rays, rgb = bank.rays(pixels), bank.colours(pixels)
+    if light is not None:
+        was = render_many(field, rays)
+        rgb = light.applied(rays.origins + rays.directions * was.depth[:, None], rgb)
+    nothing = torch.zeros(len(pixels), dtype=torch.bool)
+    return Lessons(rays, rgb, torch.full_like(pixels, -1), bank.place_of(pixels), held=nothing)
+
+
+def _asked(frames: Sequence[Frame]) -> list[int]:
+    """Indices of the old photos that teach: all of them, but only some of those that have yet to be made."""
+    made = [i for i, f in enumerate(frames) if f.made is None]
+    unmade = [i for i, f in enumerate(frames) if f.made is not None]
+    return sorted(made + unmade[:: -(-len(unmade) // _MADE) or 1])
+
+
+def at_most_of(lessons: Lessons, which: Tensor, most: int, draw: torch.Generator) -> Lessons:
+    """Those of the pixels that ``which`` (N,) bool says, ``most`` of them at random if there are more."""
+    return lessons[at_most(which.nonzero()[:, 0], most, draw)]
+
+
+def at_most(rows: Tensor, most: int, draw: torch.Generator) -> Tensor:
+    """``most`` of the rows (K,) at random, in order; all, if there are no more."""
+    return rows if len(rows) <= most else rows[torch.randperm(len(rows), generator=draw)[:most].sort().values]

@@ -75,3 +75,8 @@ def sight_of(field: Field, frames: Sequence[Frame], boxes: Sequence[Tensor]) -> 
         away = (x[rows] - frame.centre.float()).norm(dim=-1)
         before[rows] = torch.maximum(before[rows], (depth - away) / side[rows])
     return Sight(s, cells, before)
+
+
+def nothing_seen(field: Field) -> Sight:
+    """Nothing is known of what photos saw: nothing is hidden, and something may be anywhere."""
+    return Sight(field.sampler, torch.zeros(0, dtype=torch.long), torch.zeros(0))

@@ -97,9 +97,11 @@ class PaperField:
         """M_out without where anything moved in, which wins (§10.1.2), (S,) bool."""
         return (owner < 0) & self.region.contains(x)
 
-    def propose(self, rays: Rays, jitter: bool = False) -> tuple[tuple[Histogram, ...], Tensor]:
+    def propose(
+        self, rays: Rays, jitter: bool = False, draw: torch.Generator | None = None
+    ) -> tuple[tuple[Histogram, ...], Tensor]:
         """The fine-tuned proposals' histograms of N rays, and the edges (N, K + 1) in s at which to ask the field."""
-        return self.base.propose(rays, jitter, densities=tuple(map(self._mapped, self.proposals)))
+        return self.base.propose(rays, jitter, densities=tuple(map(self._mapped, self.proposals)), draw=draw)
 
     def samples(self, rays: Rays, jitter: bool = False) -> Samples:
         """Where to evaluate the field along rays: where the fine-tuned proposals expect something to be seen."""

@@ -45,12 +45,11 @@ def update_field_paper(
         what = "brings no new photos, which the paper's update learns from"
         raise InputError("the change", what, "give some, or leave --update.route out")
     say = on_stage or (lambda name: None)
-    torch.manual_seed(config.seed)
     say("supervise")
     bank = lessons(capture.train, change, config)
     say("train")
     updated = begun(checked, change, (len(bank.frames), config.look), config.dilation, config.seed)
-    run = PaperTraining(updated, bank, config)
+    run = PaperTraining(updated, bank, config, torch.Generator().manual_seed(config.seed))
     run.run(on_progress)
     say("show")
     done = ready(updated)

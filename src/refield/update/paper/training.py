@@ -27,9 +27,9 @@ OnProgress = Callable[[UpdateProgress], None]
 class PaperTraining:
     """One run. The proposals are trusted in full from the first step: they have been trained before."""
 
-    def __init__(self, field: PaperField, bank: PixelBank, config: PaperUpdateConfig) -> None:
+    def __init__(self, field: PaperField, bank: PixelBank, config: PaperUpdateConfig, draw: torch.Generator) -> None:
         """``bank``: the pixels that teach; its photos are the helper's looks."""
-        self.field, self.bank, self.config = field, bank, config
+        self.field, self.bank, self.config, self.draw = field, bank, config, draw
         self.learning = [*field.helper.parameters(), *field.proposals.parameters()]
         self.adam = torch.optim.Adam(self.learning, lr=config.rate, eps=1e-15, fused=True)
         self.proposed = -config.proposal_every
@@ -56,7 +56,7 @@ class PaperTraining:
 
     def _step(self, step: int) -> bool:
         """Whether it could be taken."""
-        pixels = torch.randint(len(self.bank), (self.config.rays,))
+        pixels = torch.randint(len(self.bank), (self.config.rays,), generator=self.draw)
         learning = step - self.proposed >= proposal_interval(step, self.config)
         loss = self._loss(pixels, learning)
         if not math.isfinite(loss.item()):
@@ -78,7 +78,7 @@ class PaperTraining:
         field, bank, c = self.field, self.bank, self.config
         rays, photo = bank.rays(pixels), bank.frame_of(pixels)
         with torch.set_grad_enabled(learning):
-            told, edges = field.propose(rays, jitter=True)
+            told, edges = field.propose(rays, jitter=True, draw=self.draw)
         samples = field.base.span.samples(edges)
         x, d = samples.positions(rays)
         sigmas, rgbs = field.seen_in(photo[samples.ray_ids], x, d)
@@ -94,4 +94,4 @@ class PaperTraining:
     def _shown(self, w: Tensor, rgbs: Tensor, samples: Samples, rays: Rays) -> Tensor:
         """The rays' colours (N, 3) (Eq. 4), over noise, as in pre-training: only opaque surfaces explain the photos."""
         rgb, opacity = accumulate_rgb(w, rgbs, samples)
-        return rgb + (1 - opacity)[:, None] * torch.rand(len(rays), 3)
+        return rgb + (1 - opacity)[:, None] * torch.rand(len(rays), 3, generator=self.draw)
