@@ -80,9 +80,8 @@ def update_field(
     step, pixel = step_near(field, middle), known.pixel(middle)
     near = _in_reach(wide.sampler(step), capture.train + change.frames)
     old = known.sparse[:0]
-    if (
-        cut.to_learn.objects
-    ):  # of what earlier visits know and have been taken from already, no old photo shows anything
+    # of what earlier visits know and have been taken from already, no old photo shows anything
+    if cut.to_learn.objects:
         old = old_lessons(capture.train, places_of(change), cut.pretrained, near, config.supervise, light, draw)
     sparse = at_most_of(known.sparse, meets(near, known.sparse.rays), _NEW_RAYS, draw)
     if len(sparse) + len(old) == 0:
