@@ -65,6 +65,18 @@ def test_a_box_tipped_onto_another_face_is_found(old, tmp_path):
     assert moved.kind == "moved" and float(angle_between(moved.new_from_old, true)) < 1.5
 
 
+def test_two_boxes_that_touched_may_each_have_their_own_change(tmp_path):
+    beside = standing((0.15, 0.15, 0.25), -0.25 + 0.35, -0.2, 0, paint=7)
+    crate = standing((0.2, 0.17, 0.18), -0.25, -0.2, 0, paint=3)
+    before = capture_of(BoxWorld((crate, beside)), tmp_path / "before")
+    true = turn(centre(crate), 50, (0.1, 0.5, 0))
+    photos = new_photos(BoxWorld((crate.moved(true),)), tmp_path)
+    change = estimate_change(before, BoxWorld((crate, beside)), photos, EstimateConfig(survey=6))
+    assert sorted(o.kind for o in change.objects) == ["moved", "removed"]
+    (moved,) = [o for o in change.objects if o.kind == "moved"]
+    assert float(angle_between(moved.new_from_old, true)) < 1.5
+
+
 def test_a_removed_box_is_found(old, tmp_path):
     (gone,) = estimate(old, BoxWorld((DRUM,)), tmp_path).objects
     assert gone.kind == "removed" and gone.new_from_old is None

@@ -6,9 +6,10 @@ next is looked for. So two newcomers whose hulls run together are told apart by 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import count
 
 import numpy as np
 import torch
@@ -32,6 +33,7 @@ from refield.estimate.outline import FEWEST_POINTS, ObjectConfig, restricted
 from refield.estimate.past import Past, changed_share, gone_score, look_past, silhouette
 from refield.estimate.pose_change import COARSEST, FINER, PoseChange, RefineConfig, refine, shared_out
 from refield.estimate.register import Candidate, RegisterConfig, Target, register
+from refield.estimate.split import halves
 from refield.field.radiance import Field
 from refield.scene.capture import Frame
 from refield.scene.planes import Plane
@@ -130,24 +132,25 @@ class Fit:
     old: Old
     """without what cannot be at its new place"""
     change: PoseChange
+    rest: Old | None = None
+    """of the outline, where only a part of it was found"""
 
 
 def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> Settled:
     """Find each old object's new place or that it left, and what else arrived."""
     touched = [k for k, old in enumerate(olds) if _may_have_changed(ground, changed, old)]
-    moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, changed)
+    moved, views, placed = _place_all(ground, {k: olds[k] for k in touched}, changed, count(len(olds)))
     trimmed_some = any(placed[k] is not olds[k] for k in touched)
-    olds = [placed.get(k, old) for k, old in enumerate(olds)]
+    every = dict(enumerate(olds)) | placed
+    olds, touched = [every[k] for k in sorted(every)], list(placed)
     shares = {k: _gone(ground, views, olds[k]) for k in touched if k not in moved}
     removed = {k: share for k, share in shares.items() if share is not None}
     kept = [k for k in touched if k in moved or k in removed]
     if len(kept) < len(touched) or trimmed_some:  # what never left hides what is behind it after all
         views = _without(ground, changed, [olds[k] for k in kept], [(olds[k], c) for k, c in moved.items()])
     gone = [olds[k] for k in kept]
-    arrived = [p for p in newcomers(ground, arrivals(ground, views, gone), views) if _substantial(ground, p, views)]
-    still = torch.eye(4, dtype=torch.float64)
-    places = [(olds[k], still) for k in kept] + [(olds[k], c.new_from_old) for k, c in moved.items()]
-    arrived = [p for p in arrived if not any(_rim_of(ground, p, old, place) for old, place in places)]
+    places = _places(gone, [(olds[k], c) for k, c in moved.items()])
+    arrived = _remarkable(ground, newcomers(ground, arrivals(ground, views, gone), views), views, places)
     arrived = [consistent(ground.hull.lattice, p, [(v.view, v.open) for v in views]) for p in arrived]
     # what its colours leave of it must be as believable as the whole was
     arrived = [p for p in arrived if fresh(views, ground.hull.lattice, p) >= ground.believe.arrived]
@@ -202,7 +205,7 @@ def _gone(ground: Ground, views: Sequence[Past], old: Old) -> float | None:
 
 
 def _place_all(
-    ground: Ground, olds: dict[int, Old], changed: Sequence[Changed]
+    ground: Ground, olds: dict[int, Old], changed: Sequence[Changed], keys: Iterator[int]
 ) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:
     """Place the changed objects that fit somewhere, in the photos without those that certainly left, then without all.
 
@@ -214,33 +217,41 @@ def _place_all(
     moved: dict[int, PoseChange] = {}
     for out, asked in [(sure, sure), (list(olds), others)] if sure and others else [(list(olds), list(olds))]:
         views = _without(ground, changed, [olds[k] for k in out], [(olds[k], c) for k, c in moved.items()])
-        more, views, placed = _place(ground, {k: olds[k] for k in out}, asked, views)
+        more, views, placed = _place(ground, {k: olds[k] for k in out}, asked, views, keys)
         moved, olds = moved | more, olds | placed
     return moved, views, olds
 
 
 def _place(
-    ground: Ground, olds: dict[int, Old], asked: Sequence[int], views: list[Past]
+    ground: Ground, olds: dict[int, Old], asked: Sequence[int], views: list[Past], keys: Iterator[int]
 ) -> tuple[dict[int, PoseChange], list[Past], dict[int, Old]]:
     """Place some of the objects that ``views`` are without, the best first, taking each off."""
     moved: dict[int, PoseChange] = {}
     tried = {k: olds[k] for k in asked[: ground.believe.most]}
     everyone, first = list(olds.values()), views
-    guess = cache(lambda k: matched_poses(olds[k], first, ground.survey, ground.matcher))
+    cut: set[int] = set()  # what is left of outlines of which a part was found
+    guess = cache(lambda k: matched_poses(tried[k], first, ground.survey, ground.matcher))
     while True:
         parts = newcomers(ground, arrivals(ground, views, everyone), views)[: ground.believe.most]
+        left = _remarkable(ground, parts, views, _places(everyone, [(olds[k], c) for k, c in moved.items()]))
         fits: dict[int, Fit] = {}
         # what moved before moves again: a piece of something else is tried only on what that leaves unexplained
         for again in (True, False):
             some = [k for k, old in tried.items() if old.remembered == again and k not in moved and parts]
-            tries = {k: _best_of(ground, olds[k], everyone, views, parts, guess(k)) for k in some}
-            fits |= {k: fit for k, fit in tries.items() if fit is not None}
+            tries = {k: _best_of(ground, olds[k], everyone, views, (parts, left), guess(k)) for k in some}
+            enough = {k: ground.believe.shown if k in cut else 0.0 for k in some}
+            fits |= {k: fit for k, fit in tries.items() if fit is not None and fit.change.explained >= enough[k]}
             if any(fit.change.explained >= ground.believe.shown for fit in fits.values()):
                 break
         if not fits:
             return moved, views, olds
         for k in _together(fits, ground.search.enough):
             olds[k], moved[k] = fits[k].old, fits[k].change
+            rest = fits[k].rest
+            if rest is not None and _may_have_changed(ground, [v.changed for v in first], rest):
+                another = next(keys)
+                olds[another] = tried[another] = rest
+                cut.add(another)
             views = take_off(ground.field, views, olds[k], moved[k])
 
 
@@ -291,6 +302,20 @@ def newcomers(ground: Ground, voxels: Voxels, past: Sequence[Past]) -> list[Voxe
             out.append(part)
             taken = [t | pixels.dilate(s, 1) for t, s in zip(taken, shadows)]
     return out
+
+
+def _places(olds: Sequence[Old], placed: Sequence[tuple[Old, PoseChange]]) -> list[tuple[Old, Tensor]]:
+    """Where objects stood and stand, each with its motion (4, 4) from where it stood."""
+    still = torch.eye(4, dtype=torch.float64)
+    return [(old, still) for old in olds] + [(old, change.new_from_old) for old, change in placed]
+
+
+def _remarkable(
+    ground: Ground, parts: Sequence[Voxels], past: Sequence[Past], places: Sequence[tuple[Old, Tensor]]
+) -> list[Voxels]:
+    """Would-be newcomers that are no scraps at the edges of objects."""
+    large = [p for p in parts if _substantial(ground, p, past)]
+    return [p for p in large if not any(_rim_of(ground, p, old, place) for old, place in places)]
 
 
 def _substantial(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
@@ -385,15 +410,53 @@ def _best_of(
     old: Old,
     olds: Sequence[Old],
     past: Sequence[Past],
+    arrived: tuple[Sequence[Voxels], Sequence[Voxels]],
+    extra: Sequence[Tensor],
+) -> Fit | None:
+    """The better fit of the outlines that an object may have, or of a part of one that may hold several things.
+
+    ``arrived``: the arrivals' components, and those that would be told as newcomers if nothing explained them: only
+    these are worth an outline cut in two.
+    """
+    (parts, newcomers_left), outlines = arrived, [old] if old.instead is None else [old, old.instead]
+    fits: list[Fit] = []
+    for one in outlines:
+        fit = best_fit(ground, one, olds, past, parts, extra)
+        fits += [fit] if fit is not None else []
+        if fit is not None and fit.change.explained >= ground.believe.shown:
+            return fit
+    whole = max(fits, key=lambda f: f.change.explained, default=None)
+    if old.remembered or not newcomers_left:
+        return whole
+    part = _part_of(ground, outlines[-1], olds, past, newcomers_left, extra)
+    if part is None or (whole is not None and whole.change.net >= part.change.net):
+        return whole
+    return part
+
+
+def _part_of(
+    ground: Ground,
+    old: Old,
+    olds: Sequence[Old],
+    past: Sequence[Past],
     parts: Sequence[Voxels],
     extra: Sequence[Tensor],
 ) -> Fit | None:
-    """The better fit of the outlines that an object may have."""
-    fit = best_fit(ground, old, olds, past, parts, extra)
-    if old.instead is None or (fit is not None and fit.change.explained >= ground.believe.shown):
-        return fit
-    fits = [fit, best_fit(ground, old.instead, olds, past, parts, extra)]
-    return max((f for f in fits if f is not None), key=lambda f: f.change.explained, default=None)
+    """The better fit of the two things that an outline may be; of the whole, if the other moved along.
+
+    Any outline can be cut, and a piece fits more easily than a thing: one is believed if it shows as much as it can.
+    """
+    fits = [(best_fit(ground, half, olds, past, parts, extra), other) for half, other in halves(old, ground.shape)]
+    found = [(fit, other) for fit, other in fits if fit is not None and fit.change.explained >= ground.believe.shown]
+    if not found:
+        return None
+    best, other = max(found, key=lambda f: f[0].change.net)
+    pose = [best.change.new_from_old]
+    if _refined(ground, other, olds, past, pose, best.score) is not None:
+        whole = _refined(ground, old, olds, past, pose, best.score)
+        if whole is not None:
+            return whole
+    return replace(best, rest=other)
 
 
 def best_fit(
@@ -408,19 +471,28 @@ def best_fit(
 
     ``parts``: the arrivals' components, any of which it may be, or be in.
     """
-    believe = ground.believe
     found: list[Candidate] = []
     for target in (t for part in parts for t in targets_of(past, ground.hull.lattice, part, old)):
         found += register(old.cloud, past, target, ground.up, ground.search, extra)
         if min(c.score for c in found) <= ground.search.enough:
             break
     found.sort(key=lambda c: c.score)
+    if not found:
+        return None
+    most = min(ground.believe.fits, found[0].score + 0.1)
+    likely = [c.new_from_old for c in found[: ground.believe.refined] if c.score <= most]
+    return _refined(ground, old, olds, past, likely, found[0].score)
+
+
+def _refined(
+    ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past], poses: Sequence[Tensor], score: float
+) -> Fit | None:
+    """The best of some poses of an object, refined; None if the photos do not show it there."""
+    believe = ground.believe
     best: PoseChange | None = None
     sight = Sight(ground.field, old, past, olds)
-    for candidate in found[: believe.refined]:
-        if candidate.score > min(believe.fits, found[0].score + 0.1):
-            break
-        change = refine(sight, candidate.new_from_old, ground.fine, COARSEST)
+    for pose in poses:
+        change = refine(sight, pose, ground.fine, COARSEST)
         if change is not None and (best is None or change.explained > best.explained + 0.02):
             best = change
     if best is not None:
@@ -435,7 +507,7 @@ def best_fit(
         least = max(least, ground.believe.sunk)
     if best.explained < max(least, best.before + gains):
         return None
-    return Fit(found[0].score, old, best)
+    return Fit(score, old, best)
 
 
 def _detail(ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor) -> Detail | None:

@@ -76,6 +76,11 @@ class PoseChange:
     """world size of a pixel at the object"""
     note: str = ""
 
+    @property
+    def net(self) -> float:
+        """Pixels at which the photos show the object, less those at which they should and do not."""
+        return (2 * self.explained - 1) * self.pixels
+
 
 @dataclass(frozen=True)
 class Linear:
