@@ -11,11 +11,13 @@ from scipy import ndimage
 
 from refield.estimate import recipe
 from refield.estimate.alone import object_alone
-from refield.estimate.associate import AssociateConfig, is_sunk, looks_gone, take_off, trimmed
+from refield.estimate.associate import looks_gone, take_off
 from refield.estimate.conclude import _shown_in
 from refield.estimate.detail import detail_of
 from refield.estimate.explain import explained_before
 from refield.estimate.faces import changed_parts
+from refield.estimate.fit import is_sunk, trimmed
+from refield.estimate.ground import AssociateConfig
 from refield.estimate.hull import HullConfig
 from refield.estimate.layers import Sight, layers_at
 from refield.estimate.look import Hidden, see, shaded

@@ -12,7 +12,8 @@ from scipy import ndimage
 from torch import Tensor
 
 from refield.estimate import past, segment
-from refield.estimate.associate import Settled, fresh, shadow_of
+from refield.estimate.arrive import fresh, shadow_of
+from refield.estimate.associate import Settled
 from refield.estimate.detect import Changed, Errors, Mask
 from refield.estimate.hull import Hull
 from refield.estimate.lattice import Lattice, Voxels

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 
 from refield.estimate import associate, detect, hull, light, look
-from refield.estimate.associate import AssociateConfig, Ground, Settled, is_crumb, looks_gone, unexplained
+from refield.estimate.associate import Settled, is_crumb, looks_gone, unexplained
 from refield.estimate.conclude import Told, concluded, disagreeing
 from refield.estimate.detect import Changed, DetectConfig, Errors, Mask
 from refield.estimate.faces import Parts, changed_parts
+from refield.estimate.ground import AssociateConfig, Ground
 from refield.estimate.hull import Hull, HullConfig
 from refield.estimate.lattice import Lattice, Voxels, grown
 from refield.estimate.light import SAME_PLACE

@@ -1,0 +1,255 @@
+"""Where an old object is now: the pose that explains the photos best, of each outline that it may have, and of the two
+things that one outline may be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from refield.estimate.arrive import shadow_of
+from refield.estimate.detail import Detail, detail_of
+from refield.estimate.explain import explained_before
+from refield.estimate.ground import Ground
+from refield.estimate.hull import votes
+from refield.estimate.lattice import Lattice, Voxels, components
+from refield.estimate.layers import Sight
+from refield.estimate.look import Array
+from refield.estimate.objects import Old
+from refield.estimate.outline import FEWEST_POINTS, restricted
+from refield.estimate.past import Past, gone_score, silhouette
+from refield.estimate.pose_change import COARSEST, FINER, PoseChange, refine, shared_out
+from refield.estimate.register import Candidate, Target, register
+from refield.estimate.split import halves
+from refield.scene.planes import Plane
+from refield.scene.pose import transform
+from refield.vision import pixels
+
+_HOLDS_MORE = 3.0  # times an object's volume; the hull of one object, carved by few photos, is about twice as large
+_MOST_PLACES = 24  # that are tried in a component that holds several objects
+
+
+@dataclass(frozen=True)
+class Fit:
+    """An old object found again."""
+
+    score: float
+    """of the registration, as `Candidate.score`"""
+    old: Old
+    """without what cannot be at its new place"""
+    change: PoseChange
+    rest: Old | None = None
+    """of the outline, where only a part of it was found"""
+
+
+def fit_of(
+    ground: Ground,
+    old: Old,
+    olds: Sequence[Old],
+    past: Sequence[Past],
+    arrived: tuple[Sequence[Voxels], Sequence[Voxels]],
+    extra: Sequence[Tensor],
+) -> Fit | None:
+    """The better fit of the outlines that an object may have, or of a part of one that may hold several things.
+
+    ``arrived``: the arrivals' components, and those that would be told as newcomers if nothing explained them: only
+    these are worth an outline cut in two.
+    """
+    (parts, newcomers_left), outlines = arrived, [old] if old.instead is None else [old, old.instead]
+    fits: list[Fit] = []
+    for one in outlines:
+        fit = best_fit(ground, one, olds, past, parts, extra)
+        fits += [fit] if fit is not None else []
+        if fit is not None and fit.change.explained >= ground.believe.shown:
+            return fit
+    whole = max(fits, key=lambda f: f.change.explained, default=None)
+    if old.remembered or not newcomers_left:
+        return whole
+    part = _part_of(ground, outlines[-1], olds, past, newcomers_left, extra)
+    if part is None or (whole is not None and whole.change.net >= part.change.net):
+        return whole
+    return part
+
+
+def _part_of(
+    ground: Ground,
+    old: Old,
+    olds: Sequence[Old],
+    past: Sequence[Past],
+    parts: Sequence[Voxels],
+    extra: Sequence[Tensor],
+) -> Fit | None:
+    """The better fit of the two things that an outline may be; of the whole, if the other moved along.
+
+    Any outline can be cut, and a piece fits more easily than a thing: one is believed if it or the whole left for
+    certain, and the photos show nearly all of it where it is.
+    """
+    pairs = halves(old, ground.shape)
+    if left_by(ground, past, old) is None:
+        pairs = [(half, other) for half, other in pairs if left_by(ground, past, half) is not None]
+    fits = [(best_fit(ground, half, olds, past, parts, extra), other) for half, other in pairs]
+    found = [(fit, other) for fit, other in fits if fit is not None and fit.change.explained >= ground.believe.shown]
+    if not found:
+        return None
+    best, other = max(found, key=lambda f: f[0].change.net)
+    pose = [best.change.new_from_old]
+    if _refined(ground, other, olds, past, pose, best.score) is not None:
+        whole = _refined(ground, old, olds, past, pose, best.score)
+        if whole is not None:
+            return whole
+    return replace(best, rest=other)
+
+
+def left_by(ground: Ground, past: Sequence[Past], old: Old) -> float | None:
+    """Part of an object's pixels that show what was behind it; None if they are too few to say that it left."""
+    share, asked = gone_score(past, old)
+    return share if share >= ground.believe.gone and asked >= 12 else None
+
+
+def best_fit(
+    ground: Ground,
+    old: Old,
+    olds: Sequence[Old],
+    past: Sequence[Past],
+    parts: Sequence[Voxels],
+    extra: Sequence[Tensor] = (),
+) -> Fit | None:
+    """The pose change that best explains the photos with one old object; None if none does.
+
+    ``parts``: the arrivals' components, any of which it may be, or be in.
+    """
+    found: list[Candidate] = []
+    for target in (t for part in parts for t in targets_of(past, ground.hull.lattice, part, old)):
+        found += register(old.cloud, past, target, ground.up, ground.search, extra)
+        if min(c.score for c in found) <= ground.search.enough:
+            break
+    found.sort(key=lambda c: c.score)
+    if not found:
+        return None
+    most = min(ground.believe.fits, found[0].score + 0.1)
+    likely = [c.new_from_old for c in found[: ground.believe.refined] if c.score <= most]
+    return _refined(ground, old, olds, past, likely, found[0].score)
+
+
+def _refined(
+    ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past], poses: Sequence[Tensor], score: float
+) -> Fit | None:
+    """The best of some poses of an object, refined; None if the photos do not show it there."""
+    believe = ground.believe
+    best: PoseChange | None = None
+    sight = Sight(ground.field, old, past, olds)
+    for pose in poses:
+        change = refine(sight, pose, ground.fine, COARSEST)
+        if change is not None and (best is None or change.explained > best.explained + 0.02):
+            best = change
+    if best is not None:
+        sight = replace(sight, detail=_detail(ground, old, past, best.new_from_old))
+        best = refine(sight, best.new_from_old, ground.fine, FINER)
+    if best is None:
+        return None
+    old, best = trimmed(ground, sight, best)
+    least = believe.explains * min(1.0, max(0.5, shown_right(ground, old, past) / believe.shown))
+    gains = believe.gains * (2 if best.before > believe.alike else 1)
+    if is_sunk(ground, old, best):  # possible, off the edge of a table; but a crumb of floor fits anywhere
+        least = max(least, ground.believe.sunk)
+    if best.explained < max(least, best.before + gains):
+        return None
+    return Fit(score, old, best)
+
+
+def _detail(ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor) -> Detail | None:
+    fine, views = ground.fine, [p.view for p in past]
+    if fine.detail == 0 or not ground.photographed:
+        return None
+    rays = shared_out(fine.detail_rays, len(views))
+    return detail_of(ground.field, old, ground.photographed, views, new_from_old, fine.detail, rays)
+
+
+def shown_right(ground: Ground, old: Old, past: Sequence[Past]) -> float:
+    """Part of an object's pixels in old photos that the old field shows as they are."""
+    threshold = float(np.median(np.concatenate([p.changed.threshold.ravel() for p in past])))
+    return explained_before([(v.photo, v.rgb, silhouette(v, old)) for v in ground.survey], threshold)
+
+
+def is_sunk(ground: Ground, old: Old, change: PoseChange) -> bool:
+    """Whether most of an object would be beneath what holds things up, at its new place."""
+    now = transform(change.new_from_old, torch.from_numpy(old.lattice.centres[old.voxels])).numpy()
+    return any((p.above(now) < -2 * _exact(old, p)).mean() > 0.5 for p in ground.planes)
+
+
+def _exact(old: Old, plane: Plane) -> float:
+    """How exact the height of an object's voxels above a plane is, world units."""
+    return max(0.25 * old.lattice.cell, plane.noise)
+
+
+def trimmed(ground: Ground, sight: Sight, change: PoseChange) -> tuple[Old, PoseChange]:
+    """The object without what cannot be at its new place (§10.2.4 on new photos).
+
+    What no old view saw behind or beneath an object counts as solid. The new photos may look at its other side; and
+    nothing reaches into what holds things up.
+    """
+    old, past = sight.old, sight.past
+    places = old.lattice.centres[old.voxels]
+    now = transform(change.new_from_old, torch.from_numpy(places)).numpy()
+    seen = [
+        (p.changed.witness(p.depth), pixels.dilate(p.changed.mask | p.changed.light | p.covered | ~p.known, 2))
+        for p in past
+    ]
+    _, against = votes(now, seen, ground.carving)
+    never = against > 0
+    for plane in ground.planes:
+        height, least = plane.above(now), _exact(old, plane)
+        if (height < -2 * least).mean() >= ground.believe.trim:  # more than a pose that is not exact
+            never |= height < least
+    if never.mean() < ground.believe.trim:
+        return old, change
+    voxels = old.voxels.copy()
+    voxels[voxels] = ~never
+    parts = components(voxels, 30)
+    if not parts or parts[0].sum() < ground.believe.core * len(places):
+        return old, change
+    smaller = restricted(old, parts[0], ground.shape)
+    if len(smaller.cloud.points) < FEWEST_POINTS:
+        return old, change
+    again = refine(replace(sight, old=smaller), change.new_from_old, ground.fine)
+    return (old, change) if again is None or again.explained <= change.explained - 0.02 else (smaller, again)
+
+
+def targets_of(past: Sequence[Past], lattice: Lattice, voxels: Voxels, old: Old) -> list[Target]:
+    """A component of the arrivals as places to register an object to; those that come later are for when it fails.
+
+    Its middle, and where its bulk is thickest. One that is much larger than the object holds others too: then the
+    object may be wherever it fits in, and need not explain the whole.
+    """
+    wanted, never = [], []
+    for p in past:
+        here = p.open & shadow_of(p.view, lattice, voxels)
+        out = ~pixels.dilate(p.changed.mask | p.changed.light | p.covered, 3)
+        wanted.append(here.astype(np.float32) - out.astype(np.float32))
+        never.append(-out.astype(np.float32))
+    inner = ndimage.distance_transform_edt(voxels)
+    if voxels.sum() * lattice.cell**3 > _HOLDS_MORE * old.volume:
+        places = _places_in(lattice, inner, old)
+        if len(places) > 1:
+            return [Target(places, tuple(never))]
+    middle = lattice.centres[voxels].mean(0)
+    bulk = lattice.centres[inner > 0.7 * inner.max()].mean(0)
+    centres = [middle] if np.linalg.norm(bulk - middle) < 4 * lattice.cell else [middle, bulk]
+    return [Target(c[None].astype(np.float32), tuple(wanted)) for c in centres]
+
+
+def _places_in(lattice: Lattice, inner: Array, old: Old) -> Array:
+    """Spread places (K, 3) where an object's thickest part fits into a component; ``inner``: voxels to its surface."""
+    thickest = float(ndimage.distance_transform_edt(old.voxels).max()) * old.lattice.cell
+    fits = np.argwhere(inner * lattice.cell > min(0.8 * thickest, 0.7 * float(inner.max()) * lattice.cell))
+    at = lattice.centres[tuple(fits.T)]
+    chosen = [int(inner[tuple(fits.T)].argmax())]
+    nearest = np.linalg.norm(at - at[chosen[0]], axis=-1)
+    while len(chosen) < _MOST_PLACES and nearest.max() > 0.5 * old.radius:
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(at - at[chosen[-1]], axis=-1))
+    return at[chosen].astype(np.float32)

@@ -1,0 +1,83 @@
+"""What every step of the association shares, and when it believes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from refield.estimate.detect import DetectConfig
+from refield.estimate.hull import Hull, HullConfig
+from refield.estimate.lattice import Voxels
+from refield.estimate.look import Array, View
+from refield.estimate.memory import Memory
+from refield.estimate.outline import ObjectConfig
+from refield.estimate.pose_change import RefineConfig
+from refield.estimate.register import RegisterConfig
+from refield.field.radiance import Field
+from refield.scene.capture import Frame
+from refield.scene.planes import Plane
+from refield.vision.matcher import Matcher
+
+
+@dataclass(frozen=True)
+class AssociateConfig:
+    """When a pose, a departure, an arrival is believed."""
+
+    touched: float = 0.5
+    """part of an old object's pixels that must have changed for it to be looked for elsewhere"""
+    fits: float = 0.62
+    """worst registration score that is refined"""
+    explains: float = 0.5
+    """part of the object's pixels that the moved object must explain"""
+    shown: float = 0.8
+    """part of the object's pixels that the field shows right in old photos; if it is less, down to half as much need be
+    explained"""
+    gains: float = 0.15
+    """by how much more than the old rendering did"""
+    alike: float = 0.5
+    """part of the pixels at its new place that look as before; if it is more, it must gain twice as much"""
+    refined: int = 6
+    """candidates of an object that are refined"""
+    gone: float = 0.45
+    """part of an object's pixels that must show what was behind it, for it to have left"""
+    arrived: float = 0.5
+    """part of a newcomer's pixels that nothing else explains"""
+    smallest: float = 0.003
+    """part of a photo that a thing must fill in one at least; a smaller one is an error of the field, or an edge"""
+    # the paper's contour area is 1 %, §10.2.2
+    trim: float = 0.03
+    """part of an object's voxels that the new photos or the ground deny, from which on it is trimmed"""
+    core: float = 0.25
+    """part of an object's voxels that must remain when it is trimmed"""
+    sunk: float = 0.8
+    """part of its pixels that must show an object which would be mostly beneath what holds things up"""
+    still: float = 1.2
+    """pixels; what moved by less stayed"""
+    most: int = 5
+    """old objects, and places, that are tried; the largest first"""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What every attempt shares."""
+
+    field: Field
+    hull: Hull
+    free: Voxels
+    """voxels on the hull's lattice in front of whatever holds things up"""
+    up: Array
+    """(3,) the support's normal"""
+    planes: Sequence[Plane]
+    """what holds things up"""
+    survey: Sequence[View]
+    memory: Memory
+    """what old photos saw"""
+    photographed: Sequence[Frame]
+    """old photos that show the old state as it was"""
+    detect: DetectConfig
+    carving: HullConfig
+    shape: ObjectConfig
+    believe: AssociateConfig
+    search: RegisterConfig
+    fine: RefineConfig
+    matcher: Matcher
