@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter, ImageFont
 from torch import Tensor
 
-from refield.estimate import associate, recipe
+from refield.estimate import fit, recipe
 from refield.estimate.detect import Changed
 from refield.estimate.hull import Hull
 from refield.estimate.lattice import Voxels
@@ -87,7 +87,7 @@ def look(work: Path) -> Stages:
     capture, before = workspace.capture(), state(workspace, 0)
     frames = load_new_photos(workspace.visit(1) / "photos", capture)
     results: dict[str, list[Any]] = {name: [] for name in ("set_light_aside", "_carved", "register", "refine")}
-    homes = (recipe.light, recipe, associate, associate)
+    homes = (recipe.light, recipe, fit, fit)
     with ExitStack() as stack:
         for module, (name, into) in zip(homes, results.items()):
             stack.enter_context(kept(module, name, into))
