@@ -199,7 +199,7 @@ def test_what_the_readme_shows_to_be_typed(changed, tmp_path, monkeypatch, capsy
     for name in ("before", "after"):
         shutil.copytree(changed.folder / name, tmp_path / name)
     monkeypatch.chdir(tmp_path)
-    small, pages = {"train": FIT_OPTIONS, "update": ["--update.steps", "40"], "view": ["--port", "0"]}, []
+    small, pages = {"train": FIT_OPTIONS, "update": ["--update.fit.steps", "40"], "view": ["--port", "0"]}, []
 
     def look(viewer) -> None:
         pages.append(urlopen(viewer.url).read())
