@@ -16,7 +16,7 @@ from refield.estimate.detail import Detail, detail_of
 from refield.estimate.explain import explained_before
 from refield.estimate.ground import Ground
 from refield.estimate.hull import votes
-from refield.estimate.lattice import Lattice, Voxels, components
+from refield.estimate.lattice import Lattice, Voxels, components, some_of
 from refield.estimate.layers import Sight
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
@@ -207,9 +207,7 @@ def trimmed(ground: Ground, sight: Sight, change: PoseChange) -> tuple[Old, Pose
             never |= height < least
     if never.mean() < ground.believe.trim:
         return old, change
-    voxels = old.voxels.copy()
-    voxels[voxels] = ~never
-    parts = components(voxels, 30)
+    parts = components(some_of(old.voxels, ~never), 30)
     if not parts or parts[0].sum() < ground.believe.core * len(places):
         return old, change
     smaller = restricted(old, parts[0], ground.shape)

@@ -73,6 +73,13 @@ def components(voxels: Voxels, smallest: int) -> list[Voxels]:
     return [labels == k for k in order]
 
 
+def some_of(voxels: Voxels, which: NDArray[np.bool_]) -> Voxels:
+    """Those of the voxels that are named, in the order of ``voxels.nonzero()``, (K,)."""
+    out = voxels.copy()
+    out[voxels] = which
+    return out
+
+
 def grown(voxels: Voxels, steps: int, within: Voxels | None = None) -> Voxels:
     """Dilated by ``steps`` in every direction, staying ``within``; steps < 0 grow until nothing is left to reach."""
     if steps == 0:

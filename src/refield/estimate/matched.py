@@ -22,6 +22,7 @@ from refield.estimate.look import View
 from refield.estimate.objects import Old
 from refield.estimate.past import Past, silhouette
 from refield.scene.camera import Camera
+from refield.scene.colmap import colmap_camera
 from refield.vision import pixels
 from refield.vision.matcher import Matcher
 
@@ -112,8 +113,7 @@ def camera_from_object(
     """cam_from_old (4, 4) of one photo (Eq. 8), or None. ``most_error``: pixels within which a point agrees."""
     if len(uv) < least:
         return None
-    lens = [camera.fx, camera.fy, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
-    model = pycolmap.Camera(model="OPENCV", width=camera.width, height=camera.height, params=lens)
+    model = colmap_camera(pycolmap, camera, 1)
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = most_error
     options.ransac.random_seed = 0

@@ -14,7 +14,7 @@ import torch
 from scipy import ndimage
 
 from refield.estimate.carve_kernels import Window, find_solid, packed
-from refield.estimate.lattice import Lattice, Voxels, components, grown
+from refield.estimate.lattice import Lattice, Voxels, components, grown, some_of
 from refield.estimate.look import spread_out
 from refield.estimate.objects import Old, Patch, corners_of, look_around, surface_cloud
 from refield.field.radiance import Field
@@ -177,9 +177,7 @@ def _cut_out(
         seen = inside.numpy() & (behind < thick)
         asked += seen
         outside += seen & ~mask.ravel()[where.numpy()]
-    kept = voxels.copy()
-    kept[voxels] = outside <= config.outside * asked
-    parts = components(kept, 30)
+    parts = components(some_of(voxels, outside <= config.outside * asked), 30)
     return parts[0] if parts else np.zeros_like(voxels)
 
 

@@ -13,7 +13,7 @@ from scipy.linalg import eigh
 from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.spatial import cKDTree
 
-from refield.estimate.lattice import Voxels
+from refield.estimate.lattice import some_of
 from refield.estimate.objects import Cloud, Old
 from refield.estimate.outline import FEWEST_POINTS, ObjectConfig, restricted
 from refield.vision import pixels
@@ -28,15 +28,9 @@ def halves(old: Old, config: ObjectConfig) -> list[tuple[Old, Old]]:
         return []
     side = _best_cut(_alike(old.cloud))
     nearest = cKDTree(old.cloud.points).query(old.lattice.centres[old.voxels])[1]
-    one, other = (restricted(old, _some(old.voxels, mine[nearest]), config) for mine in (side, ~side))
+    one, other = (restricted(old, some_of(old.voxels, mine[nearest]), config) for mine in (side, ~side))
     enough = min(len(o.cloud.points) for o in (one, other)) >= FEWEST_POINTS
     return [(one, other), (other, one)] if enough else []
-
-
-def _some(voxels: Voxels, which: NDArray[np.bool_]) -> Voxels:
-    out = voxels.copy()
-    out[voxels] = which
-    return out
 
 
 def _alike(cloud: Cloud) -> csc_matrix:

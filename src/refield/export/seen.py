@@ -128,8 +128,7 @@ def tolerance_of(views: Sequence[View]) -> float:
         there = views[other]
         local = transform(invert(there.world_from_cam), ends_of(view)[0][::7])
         pixels, z = there.camera.project(local)
-        size = pixels.new_tensor([there.camera.width, there.camera.height])
-        inside = (z > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+        inside = there.camera.shows(pixels, z)
         column, row = pixels[inside].long().T
         ratio = there.depth[row, column] / local[inside].norm(dim=-1)
         found.append(ratio[ratio.isfinite() & (ratio > 0)].log())
@@ -168,8 +167,7 @@ def asked(view: View, xyz: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Te
     those that it looks through."""
     local = transform(invert(view.world_from_cam), xyz)
     pixels, z = view.camera.project(local)
-    size = pixels.new_tensor([view.camera.width, view.camera.height])
-    inside = ((z > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)).nonzero()[:, 0]
+    inside = view.camera.shows(pixels, z).nonzero()[:, 0]
     at, distance = pixels[inside], local[inside].norm(dim=-1)
     column, row = at.long().T
     before = distance < view.nearest[row, column] * (1 - tolerance)

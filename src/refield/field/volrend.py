@@ -69,6 +69,10 @@ class Rendering:
     opacity: Tensor
     """(...,) float32 in [0, 1]"""
 
+    def surface(self, opaque: float) -> Tensor:
+        """The depth where more than this part of the light is stopped, (...,); inf where no surface is."""
+        return torch.where(self.opacity > opaque, self.depth, torch.inf)
+
     def reshape(self, *shape: int) -> Rendering:
         return Rendering(self.rgb.reshape(*shape, 3), self.depth.reshape(shape), self.opacity.reshape(shape))
 

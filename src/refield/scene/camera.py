@@ -67,6 +67,11 @@ class Camera:
         xy = self._distort(xy) if self.is_distorted else xy
         return xy * xy.new_tensor([self.fx, self.fy]) + xy.new_tensor([self.cx, self.cy]), z
 
+    def shows(self, pixels: Tensor, z: Tensor) -> Tensor:
+        """Whether projected points, pixels (..., 2) and depths along the axis (...,), fall in the picture, (...,)."""
+        size = pixels.new_tensor([self.width, self.height])
+        return (z > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+
     def unproject(self, pixels: Tensor) -> Tensor:
         """Pixels (..., 2) -> unit directions (..., 3) in camera axes."""
         xy = (pixels - pixels.new_tensor([self.cx, self.cy])) / pixels.new_tensor([self.fx, self.fy])

@@ -65,13 +65,12 @@ def sight_of(field: Field, frames: Sequence[Frame], boxes: Sequence[Tensor]) -> 
         camera = frame.camera.shrunk(min(_SIDE / max(frame.camera.width, frame.camera.height), 1.0))
         pose = frame.world_from_cam
         uv, z = camera.project((x - pose[:3, 3].float()) @ pose[:3, :3].float())
-        inside = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-        rows = inside.nonzero()[:, 0]
+        rows = camera.shows(uv, z).nonzero()[:, 0]
         if len(rows) == 0:
             continue
         j, i = uv[rows].long().unbind(-1)
         seen = render_camera(field, camera, pose)
-        depth = torch.where(seen.opacity > 0.5, seen.depth, torch.inf)[i, j]  # nothing is in the way of nothing
+        depth = seen.surface(0.5)[i, j]  # nothing is in the way of nothing
         away = (x[rows] - frame.centre.float()).norm(dim=-1)
         before[rows] = torch.maximum(before[rows], (depth - away) / side[rows])
     return Sight(s, cells, before)

@@ -195,17 +195,13 @@ def changed(now: Rendering, was: Rendering) -> tuple[Tensor, Tensor]:
     """(H, W) bool each: pixels that look different, where something is farther off now than before or as far, and
     where something is nearer."""
     differs = (now.rgb - was.rgb).abs().amax(-1) > _DIFFERS
-    nearer = _depth(now) < _depth(was) * (1 - _NEARER)
+    nearer = now.surface(0.5) < was.surface(0.5) * (1 - _NEARER)
     return (differs & ~nearer).cpu(), (differs & nearer).cpu()
-
-
-def _depth(shown: Rendering) -> Tensor:
-    return torch.where(shown.opacity > 0.5, shown.depth, torch.inf)
 
 
 def _depth_colours(shown: Rendering) -> Tensor:
     """Near is red and far is blue, black where nothing is."""
-    nearness = 1 / _depth(shown).cpu().clamp_min(1e-9)
+    nearness = 1 / shown.surface(0.5).cpu().clamp_min(1e-9)
     there = nearness > 0
     if not bool(there.any()):
         return torch.zeros(*nearness.shape, 3)
@@ -219,4 +215,4 @@ def _along_axis(shown: Rendering, camera: Camera) -> Tensor:
     """(H, W) float32: depths along the optical axis, in place of those along the rays."""
     eye = torch.eye(4, dtype=torch.float64)
     cosine = camera_rays(camera, eye).directions[:, 2].reshape(camera.height, camera.width)
-    return _depth(shown).cpu() * cosine
+    return shown.surface(0.5).cpu() * cosine

@@ -50,7 +50,6 @@ def best_view(frames: Sequence[Frame], change: SceneChange) -> Frame:
 
     def shown(frame: Frame) -> int:
         pixels, depth = frame.camera.project(transform(invert(frame.world_from_cam.double()), points))
-        within = (pixels >= 0).all(-1) & (pixels[:, 0] < frame.camera.width) & (pixels[:, 1] < frame.camera.height)
-        return int((within & (depth > 0)).sum())
+        return int(frame.camera.shows(pixels, depth).sum())
 
     return max(frames, key=shown)

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import torch
-from torch import Tensor
-
 from refield.evaluate import Report
 from refield.field.volrend import Rendering
 from refield.report import Comparison, VisitReport
@@ -14,7 +11,8 @@ from refield.scene.change import SceneChange
 from refield.scene.images import frame_image
 from refield.visits.telling import Telling
 
-_OPAQUE = 0.9  # of the light has to end in what is taken for a surface
+OPAQUE = 0.9
+"""of the light has to end in what is taken for a surface"""
 
 
 def page(
@@ -60,11 +58,6 @@ def marked_photos(change: SceneChange) -> tuple[Comparison, ...]:
     return tuple(view for view in _photos(change, None, None) if view.photo is not None)
 
 
-def surface_depth(shown: Rendering) -> Tensor:
-    """A rendering's depth, inf where no surface is."""
-    return torch.where(shown.opacity > _OPAQUE, shown.depth, torch.inf)
-
-
 def _photos(
     change: SceneChange, before: Sequence[Rendering] | None, after: Sequence[Rendering] | None
 ) -> tuple[Comparison, ...]:
@@ -80,8 +73,8 @@ def _photos(
                 photo=frame_image(frame),
                 before=None if before is None else before[used].rgb,
                 after=None if after is None else after[used].rgb,
-                depth_before=None if before is None else surface_depth(before[used]),
-                depth_after=None if after is None else surface_depth(after[used]),
+                depth_before=None if before is None else before[used].surface(OPAQUE),
+                depth_after=None if after is None else after[used].surface(OPAQUE),
                 mask_in=change.masks_in[used] if change.masks_in else None,
                 mask_out=change.masks_out[used] if change.masks_out else None,
                 unclear=change.unexplained[used] if change.unexplained else None,
