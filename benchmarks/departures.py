@@ -48,7 +48,6 @@ OFF: dict[str, UpdateConfig] = {
     "freeze.unseen": replace(DEFAULT, freeze=FreezeConfig(unseen=False)),
     "fit.emptiness 0": replace(DEFAULT, fit=replace(PATIENT, emptiness=0.0)),
     "fit.directions": replace(DEFAULT, fit=replace(PATIENT, directions=True)),
-    "fit.sparse-share none": replace(DEFAULT, fit=replace(PATIENT, sparse_share=None)),
     "show.spared": replace(DEFAULT, show=ShowConfig(spared=False)),
     "all of these": UpdateConfig(
         cut=CutConfig(dilation=2.0, sides=False, bare=False),
@@ -56,7 +55,7 @@ OFF: dict[str, UpdateConfig] = {
         supervise=SuperviseConfig(exposure=False),
         ground=GroundConfig(footholds=False, textured=False),
         freeze=FreezeConfig(unseen=False),
-        fit=replace(PATIENT, emptiness=0.0, directions=True, sparse_share=None),
+        fit=replace(PATIENT, emptiness=0.0, directions=True),
         show=ShowConfig(spared=False),
     ),
 }

@@ -97,9 +97,6 @@ def test_numbers_of_the_method_are_those_that_are_used() -> None:
     update, fit = UpdateConfig(), NerfactoFitConfig()
     assert f"box {update.cut.dilation:g} times as large (`--update.cut.dilation`)" in told
     assert update.ground.reach == 2 and "within twice its size (`--update.ground.reach`)" in told
-    assert (
-        update.fit.sparse_share == 0.5 and "half of the rays from the new photos (`--update.fit.sparse-share`)" in told
-    )
     assert f"{update.fit.steps} steps at most" in told
     assert f"the paper's {update.supervise.shadow:g} and {update.supervise.far:g} of the width" in told
     assert f"of what they leave {_RING_RAYS // 1000} 000 rays" in told

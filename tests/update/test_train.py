@@ -158,14 +158,14 @@ def test_what_judges_is_never_fitted_to(case: tuple[Capture, SceneChange], monke
     wrapped(train, "spared", judged, 1)
     own = train.HelperTraining
 
-    def watched(helper: HashField, frozen: Field, sparse: Lit, old: Lit, judge: Lit, *more: Any) -> HelperTraining:
-        taught.extend([sparse.lessons, old.lessons])
+    def watched(helper: HashField, frozen: Field, told: Lit, judge: Lit, *more: Any) -> HelperTraining:
+        taught.append(told.lessons)
         judged.append(judge.lessons)
-        return own(helper, frozen, sparse, old, judge, *more)
+        return own(helper, frozen, told, judge, *more)
 
     monkeypatch.setattr(train, "HelperTraining", watched)
     update_field(capture, OLD_FIELD, change, steps(1))
-    assert len(taught) == 5 and len(judged) == 2  # light, shading, ground, new and old photos
+    assert len(taught) == 4 and len(judged) == 2  # light, shading, ground, helper
     assert all(len(t) and not t.held.any() for t in taught) and all(len(j) and j.held.all() for j in judged)
 
 
@@ -187,7 +187,7 @@ def test_every_departure_from_the_paper_can_be_switched_off(
         freeze=FreezeConfig(unseen=False),
         show=ShowConfig(spared=False),
     )
-    off = replace(off, fit=replace(off.fit, directions=True, sparse_share=None))
+    off = replace(off, fit=replace(off.fit, directions=True))
     plain = update_field(capture, OLD_FIELD, change, off)
     assert len(judged) == 1
     assert usual.eyes is not None and plain.eyes is None

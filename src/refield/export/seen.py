@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from refield.field.radiance import Field
 from refield.field.render import render_camera
+from refield.field.volrend import OPAQUE, depths_around
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, camera_rays
 from refield.scene.pose import invert, transform
@@ -25,8 +26,6 @@ Progress = Callable[[int, int], None]
 
 RAYS = 2_000_000
 """asked of a field for all views together, about and at most"""
-OPAQUE = 0.9
-"""of the light has to end in what is taken for a surface"""
 _PIECE = 200_000  # points that are looked at at once
 _AGREE = 2  # views, its own among them, have to show a point
 _THROUGH = 0.25  # of as many views as show a point may look through it
@@ -105,10 +104,7 @@ def _view(field: Field, frame: Frame, camera: Camera) -> View:
     # single pixels stray where a ray passes by an edge
     calm = cv2.medianBlur(torch.where(there, depth, torch.inf).numpy(), 3)
     depth = torch.where(there, torch.from_numpy(calm), torch.inf)
-    around = functional.pad(depth[None, None], (1, 1, 1, 1), mode="replicate")
-    farthest = functional.max_pool2d(around, 3, stride=1)[0, 0]
-    nearest = -functional.max_pool2d(-around, 3, stride=1)[0, 0]
-    return View(camera, frame.world_from_cam, shown.rgb.cpu().clamp(0, 1), depth, nearest, farthest)
+    return View(camera, frame.world_from_cam, shown.rgb.cpu().clamp(0, 1), depth, *depths_around(depth))
 
 
 def ends_of(view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from refield.export.seen import OPAQUE, View, asked, ends_of, seen_by, tolerance_of
+from refield.export.seen import View, asked, ends_of, seen_by, tolerance_of
 from refield.field.radiance import Field
 from refield.field.render import render_many
+from refield.field.volrend import OPAQUE
 from refield.scene.capture import Rays
 
 POINTS = 300_000

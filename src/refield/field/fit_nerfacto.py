@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
@@ -28,17 +28,17 @@ from refield.scene.capture import Capture, Rays
 
 
 @dataclass(frozen=True)
-class NerfactoFitConfig:
-    """Pre-training of the NeRFacto shape; the numbers are nerfstudio's, but for the background."""  # §10.1.1
+class Schedule:
+    """What a NeRFacto field's training and the paper's update share; the numbers are nerfstudio's."""  # §10.1.1
 
     steps: int = 30_000
     """of gradient descent"""
     max_seconds: float | None = None
     """stop in time"""
     rays: int = 4096
-    """a step"""
+    """a step, drawn from all pixels that teach"""
     rate: float = 1e-2
-    """Adam's learning rate at the first step"""
+    """Adam's learning rate at the first step, of the field and of the proposal networks"""
     final_rate: float = 1e-4
     """and after ``decay_steps``, exponentially"""
     decay_steps: int = 200_000
@@ -48,15 +48,25 @@ class NerfactoFitConfig:
     distortion: float = 2e-3
     """weight of the distortion loss"""
     gradient_unit: float = 1.0
-    """gradient scaling reaches 1 at this many core radii from the camera; 0 turns it off"""  # §10.1
-    anneal_slope: float = 10.0
-    """how steeply the proposals come to be trusted"""
-    anneal_steps: int = 1000
-    """after which they are trusted in full"""
+    """gradient scaling reaches 1 at this many core radii of the fitted field from the camera; 0: off"""  # §10.1
     proposal_every: int = 5
     """steps between the proposals' own steps, at the end"""
     proposal_warmup: int = 5000
     """steps over which that interval grows from 1"""
+    check_every: int = 250
+    """steps between looks at how far it is"""
+    seed: int = 0
+    """of all that is drawn at random"""
+
+
+@dataclass(frozen=True)
+class NerfactoFitConfig(Schedule):
+    """Pre-training of the NeRFacto shape; the numbers are nerfstudio's, but for the background."""  # §10.1.1
+
+    anneal_slope: float = 10.0
+    """how steeply the proposals come to be trusted"""
+    anneal_steps: int = 1000
+    """after which they are trusted in full"""
     background: Literal["random", "last_sample"] = "random"
     """what is seen through what stays transparent: noise, or as in nerfstudio the last sample's colour. That leaves the
     last sample's density open, and renderings here are on black"""
@@ -66,9 +76,6 @@ class NerfactoFitConfig:
     """at which the photos are read"""
     field: NerfactoConfig = field(default_factory=NerfactoConfig)
     """shape of the field"""
-    check_every: int = 250
-    """steps between looks at the held-out pixels"""
-    seed: int = 0
 
 
 REDUCED = NerfactoFitConfig(
@@ -255,21 +262,6 @@ class _NerfactoFit:
             self.on_progress(
                 FitProgress(self.done, self.config.steps, psnr, rate, shape.samples, seconds, max(left, 0.0))
             )
-
-
-class Schedule(Protocol):
-    """How fast a field and its proposal networks learn, step by step; see `NerfactoFitConfig`."""
-
-    @property
-    def rate(self) -> float: ...
-    @property
-    def final_rate(self) -> float: ...
-    @property
-    def decay_steps(self) -> int: ...
-    @property
-    def proposal_every(self) -> int: ...
-    @property
-    def proposal_warmup(self) -> int: ...
 
 
 def rate_at(step: int, config: Schedule) -> float:

@@ -14,6 +14,7 @@ import torch
 from numba import njit, prange
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from refield.field import kernels
 from refield.field.kernels.cpu.simd import JIT
@@ -22,6 +23,9 @@ from refield.scene.capture import Rays
 from refield.scene.images import png
 
 _Samples = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
+
+OPAQUE = 0.9
+"""of the light has to end in what is taken for a surface"""
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ class Rendering:
     opacity: Tensor
     """(...,) float32 in [0, 1]"""
 
-    def surface(self, opaque: float) -> Tensor:
+    def surface(self, opaque: float = OPAQUE) -> Tensor:
         """The depth where more than this part of the light is stopped, (...,); inf where no surface is."""
         return torch.where(self.opacity > opaque, self.depth, torch.inf)
 
@@ -87,6 +91,12 @@ class Rendering:
     def joined(parts: Sequence[Rendering]) -> Rendering:
         """Those of one set of rays after the other, one at least."""
         return Rendering(*(torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "depth", "opacity")))
+
+
+def depths_around(depth: Tensor) -> tuple[Tensor, Tensor]:
+    """A picture's depths (H, W) -> the least and the greatest of each pixel and its neighbours, (H, W) each."""
+    rows = depth[None, None]
+    return -functional.max_pool2d(-rows, 3, 1, 1)[0, 0], functional.max_pool2d(rows, 3, 1, 1)[0, 0]
 
 
 def weights(sigmas: Tensor, samples: Samples) -> Tensor:

@@ -16,8 +16,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
+from refield.field.volrend import depths_around
 from refield.report.visit import Comparison
 from refield.report.words import up_of
 from refield.scene.boxes import across, upright_box
@@ -115,9 +115,8 @@ def _points(views: Sequence[tuple[Comparison, Tensor, Tensor]]) -> tuple[Tensor,
 
 def _calm(depth: Tensor) -> Tensor:
     """(H, W) bool: pixels that show a surface, not beside an edge, where a pixel holds some of what lies behind."""
-    around = functional.pad(depth[None, None].float(), (1, 1, 1, 1), mode="replicate")
-    farthest, nearest = functional.max_pool2d(around, 3, stride=1), -functional.max_pool2d(-around, 3, stride=1)
-    return (farthest < _EDGE * nearest)[0, 0]
+    nearest, farthest = depths_around(depth.float())
+    return farthest < _EDGE * nearest
 
 
 def _places(o: ObjectChange, world: World | None) -> tuple[Tensor | None, Tensor | None]:

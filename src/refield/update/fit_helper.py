@@ -41,8 +41,6 @@ class HelperConfig:
     """for all of the steps; the learning rate follows whichever of steps and seconds is further on"""
     samples: int = 8192
     """of the helper in a step"""
-    sparse_share: float | None = 0.5
-    """of each batch's rays drawn from the new photos; None: all pixels alike, old and new, as the paper draws them"""
     directions: bool = False
     """let its colours depend on the direction, as the paper's do; what few photos say of that does not hold between
     them"""
@@ -89,8 +87,7 @@ class HelperTraining:
         self,
         helper: HashField,
         frozen: UpdatedField,
-        sparse: Lit,
-        old: Lit,
+        taught: Lit,
         judge: Lit,
         config: HelperConfig,
         draw: torch.Generator,
@@ -98,8 +95,7 @@ class HelperTraining:
         sight: Sight | None = None,
     ) -> None:
         self.helper, self.config, self.frozen, self.draw = helper, config, frozen, draw
-        lessons, fixed = sparse.lessons.followed_by(old.lessons), Segments.joined([sparse.fixed, old.fixed])
-        self.taught, self.new_rays, self.judge = Lit(lessons, fixed), len(sparse.lessons), judge
+        self.taught, self.judge = taught, judge
         added = tuple(o.grid for o in frozen.change.objects if o.kind == "added")
         taken = Region(added + frozen.bare.grids)
         self.misplaced = config.emptiness * emptiness(frozen.change, helper.sampler, taken, ground, sight)
@@ -177,18 +173,10 @@ class HelperTraining:
     def _taken(self, x: Tensor) -> Tensor:
         return self.frozen.arrived(x) >= 0
 
-    def _drawn(self) -> Tensor:
-        """Rays of a step, (N,) int64: the new photos' share of them first."""
-        n, new, old = self.rays_per_step, self.new_rays, len(self.taught.lessons) - self.new_rays
-        share = new / max(new + old, 1) if self.config.sparse_share is None else self.config.sparse_share
-        n_new = n if not old else round(n * share) if new else 0
-        shares = ((new, n_new), (old, n - n_new))
-        of_new, of_old = (torch.randint(max(most, 1), (k,), generator=self.draw) for most, k in shares)
-        return torch.cat([of_new, new + of_old])
-
     def _step(self, step: int, rate: float) -> None:
-        chosen, helper, c = self._drawn(), self.helper, self.config
-        n, lessons, fixed = len(chosen), self.taught.lessons, self.taught.fixed
+        helper, c, n = self.helper, self.config, self.rays_per_step
+        lessons, fixed = self.taught.lessons, self.taught.fixed
+        chosen = torch.randint(len(lessons), (n,), generator=self.draw)
         rays, sampler = lessons.rays[chosen], helper.sampler
         # what stays transparent is shown noise, so that only opaque surfaces explain the photos
         jitter, shown = (torch.rand(*shape, generator=self.draw) for shape in ((n,), (n, 3)))

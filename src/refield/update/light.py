@@ -7,23 +7,19 @@ pixels that were left out of a fit confirm it. Letters: P pixels, C lattice node
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
 
-import numpy as np
 import torch
-from numba import njit, prange
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from refield.field.kernels.cpu.simd import JIT
+from refield.field import kernels
+from refield.field.kernels import onward
+from refield.field.kernels.onward import NO_LIGHTS, Lights
 from refield.field.sampling import OccupancySampler
 from refield.field.warp import inside_box
-from refield.scene.inside import cell_along
-
-_Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -34,16 +30,6 @@ class Relighting:
     """(2, 3) float32, corner to corner of the nodes"""
     log_gain: Tensor
     """(X, Y, Z, 3) float32, natural logarithm of the factor of each channel"""
-
-    def gain(self, x: Tensor) -> Tensor:
-        """World points (S, 3) -> factors (S, 3); 1 outside the box."""
-        lo, hi = self.aabb
-        unit = (x - lo) / (hi - lo) * 2 - 1
-        volume = self.log_gain.permute(3, 0, 1, 2)[None].contiguous()
-        at = unit.flip(-1)[None, :, None, None]  # grid_sample's first coordinate runs along the last axis
-        out = functional.grid_sample(volume, at, padding_mode="border", align_corners=True)
-        factor = torch.exp(out.reshape(3, -1).T)
-        return torch.where(inside_box(x.detach(), self.aabb)[:, None], factor, torch.ones_like(factor))
 
     def cells(self, sampler: OccupancySampler) -> Tensor:
         """Cells of a sampler's grid in which some factor is not 1, (R, R, R) uint8, and perhaps some beside them."""
@@ -72,15 +58,25 @@ class Relighting:
         return Relighting(box.float(), self.log_gain[i:l, j:m, k:n].contiguous())
 
     def applied(self, x: Tensor, rgb: Tensor) -> Tensor:
-        """World points (S, 3), colours (S, 3) -> colours in the new light (S, 3) in [0, 1]."""
-        if x.device.type == "cpu" and not (torch.is_grad_enabled() and (x.requires_grad or rgb.requires_grad)):
-            out = rgb.clone()
-            _relight(x.detach().float().numpy(), self.aabb.numpy(), self.log_gain.numpy(), out.numpy())
-            return out
-        near = inside_box(x.detach(), self.aabb).nonzero()[:, 0]
-        if len(near) == 0:
-            return rgb
-        return rgb.index_copy(0, near, (rgb[near] * self.gain(x[near])).clamp(0, 1))
+        """World points (S, 3), colours (S, 3) -> colours in the new light (S, 3) in [0, 1], as they are outside of the
+        box."""
+        asked = x.requires_grad or rgb.requires_grad
+        relight = onward.relight if torch.is_grad_enabled() and asked else kernels.relight
+        return relight(x, rgb, self._lights)
+
+    @cached_property
+    def _lights(self) -> Lights:
+        return lights_of([self])
+
+
+def lights_of(lights: Sequence[Relighting]) -> Lights:
+    """One light after the other, as kernels take them."""
+    if not lights:
+        return NO_LIGHTS
+    shapes = torch.tensor([light.log_gain.shape[:3] for light in lights])
+    firsts = torch.cat([shapes.new_zeros(1), shapes.prod(-1).cumsum(0)[:-1]])
+    boxes = torch.stack([light.aabb.float() for light in lights])
+    return Lights(boxes, shapes, firsts, torch.cat([light.log_gain.reshape(-1, 3).float() for light in lights]))
 
 
 @dataclass(frozen=True)
@@ -103,25 +99,6 @@ class Sightings:
         """The same with world cubes of this side as groups, each between cubes of the other groups."""
         patch = (self.x / side).floor().long()
         return replace(self, fold=(patch * torch.tensor([1, 3, 5])).sum(-1).remainder(_PATCH_FOLDS))
-
-
-@njit(parallel=True, **JIT)
-def _relight(x: _Array, aabb: _Array, log_gain: _Array, rgb: _Array) -> None:
-    """`Relighting.applied`, in place."""
-    nx, ny, nz = log_gain.shape[:3]
-    for s in prange(len(x)):
-        i, u = cell_along(x[s, 0], aabb[0, 0], aabb[1, 0], nx)
-        j, v = cell_along(x[s, 1], aabb[0, 1], aabb[1, 1], ny)
-        k, w = cell_along(x[s, 2], aabb[0, 2], aabb[1, 2], nz)
-        if i < 0 or j < 0 or k < 0:
-            continue
-        for c in range(3):
-            total = np.float32(0)
-            for corner in range(8):
-                a, b, d = corner >> 2 & 1, corner >> 1 & 1, corner & 1
-                weight = (u if a else 1 - u) * (v if b else 1 - v) * (w if d else 1 - w)
-                total += weight * log_gain[i + a, j + b, k + d, c]
-            rgb[s, c] = min(max(rgb[s, c] * math.exp(total), 0), 1)
 
 
 _PATCH_FOLDS = 4

@@ -21,9 +21,9 @@ from refield.field.warp import leaving
 from refield.scene.capture import Rays
 from refield.scene.inside import spans
 from refield.update.cells import Cells
-from refield.update.light import Relighting
+from refield.update.light import Relighting, lights_of
 from refield.update.region import finer
-from refield.update.view import View, boxes_around, lights_of
+from refield.update.view import View, boxes_around
 
 if TYPE_CHECKING:
     from refield.update.composite import UpdatedField
@@ -96,7 +96,8 @@ class Marching:
             return None
         known, told = self.split
         gone = ((self.base.sampler.grid > 0) & (known.grid == 0)).to(torch.uint8)
-        return View(self.base, gone, told, boxes_around(told, self.boxes), lights_of(self.lights), self.field)
+        lights = lights_of([small for light in self.lights if (small := light.cropped()) is not None])
+        return View(self.base, gone, told, boxes_around(told, self.boxes), lights, self.field)
 
     def unchanged(self, rays: Rays) -> tuple[Field, Tensor]:
         """The field before, and which of N rays show what it shows, (N,) bool: they meet no cell in which this visit

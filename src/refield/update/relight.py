@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from refield.field.render import render_many
+from refield.field.volrend import OPAQUE
 from refield.field.warp import crosses, outline
 from refield.scene.pose import transform
 from refield.update.cut import Known
@@ -15,7 +16,6 @@ from refield.update.region import Region, meets
 from refield.update.supervision import at_most_of
 
 _RAYS = 60_000  # of the new photos, for the light on all and on each object; a lattice of factors is no finer
-_SURFACE = 0.9  # opacity, from which on a ray is taken to show a surface
 _AROUND = 1.5  # sides of the largest object, so far around all places light is looked for
 _SPACING = 1.5  # pixels of the nearest new photo, the lattice's spacing
 _PATCH = 4.0  # cells of the lattice that are left out together where one photo alone shows a place
@@ -45,7 +45,7 @@ def light_of(known: Known, draw: torch.Generator) -> Relighting | None:
     seen = at_most_of(sparse, still & crosses(sparse.rays, [box]), _RAYS, draw)
     was = render_many(known.cut, seen.rays)
     x = seen.rays.origins + seen.rays.directions * was.depth[:, None]
-    solid = (was.opacity > _SURFACE).nonzero()[:, 0]
+    solid = (was.opacity > OPAQUE).nonzero()[:, 0]
     spacing = _SPACING * known.pixel(box.mean(0))
     return fit_light(Sightings(x, seen.rgb, was.rgb, seen.photo)[solid], box, spacing, _PATCH * spacing)
 
@@ -63,7 +63,7 @@ def shading_of(known: Known, draw: torch.Generator) -> tuple[Relighting | None, 
         now = render_many(cut, seen.rays)
         x = seen.rays.origins + seen.rays.directions * now.depth[:, None]
         asked = transform(move.old_from_new, x)
-        solid = ((now.opacity > _SURFACE) & (cut.arrived(x) == i)).nonzero()[:, 0]
+        solid = ((now.opacity > OPAQUE) & (cut.arrived(x) == i)).nonzero()[:, 0]
         box = outline(move.grid)
         side = float((box[1] - box[0]).mean())
         sightings = Sightings(asked, seen.rgb, now.rgb, seen.photo).in_patches(side / _PATCHES)

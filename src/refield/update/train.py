@@ -84,7 +84,8 @@ def update_field(
     if cut.to_learn.objects:
         old = old_lessons(capture.train, places_of(change), cut.pretrained, near, config.supervise, light, draw)
     sparse = at_most_of(known.sparse, meets(near, known.sparse.rays), _NEW_RAYS, draw)
-    if len(sparse) + len(old) == 0:
+    taught = sparse.taught.followed_by(old)
+    if len(taught) == 0:
         return done(cut.but(learnt=lit), "no photo shows any of it, so that nothing could be learnt")
     seen_from = centres(capture.train).float()
     ground = ground_of(known, old, wide, seen_from, max(pixel, step), draw) if config.ground.footholds else []
@@ -98,11 +99,10 @@ def update_field(
     frozen = cut.but(learnt=replace(lit, region=told)).unshown(sight.hidden)
     if not region.grid.any():
         return done(frozen, "there is nothing but the ground to show")
-    parts = (sparse.taught, old, sparse.judging)
-    taught, remembered, judge = (Lit(some, fixed_along(frozen, region, some.rays, ground)) for some in parts)
+    teaching, judging = (Lit(some, fixed_along(frozen, region, some.rays, ground)) for some in (taught, sparse.judging))
     say("train")
     helper = new_helper(region, change.frames, config.seed, directions=config.fit.directions)
-    run = HelperTraining(helper, frozen, taught, remembered, judge, config.fit, draw, ground, sight)
+    run = HelperTraining(helper, frozen, teaching, judging, config.fit, draw, ground, sight)
     run.run(on_progress)
     say("show")
     helper.requires_grad_(False)

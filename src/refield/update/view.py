@@ -13,14 +13,13 @@ import torch
 from torch import Tensor
 
 from refield.field import kernels
-from refield.field.kernels.onward import NO_LIGHTS, Lights, Shown, Way, summed
+from refield.field.kernels.onward import Lights, Shown, Way, summed
 from refield.field.kernels.reference import Lattice, Networks, Rays3, Space
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP, OccupancySampler
 from refield.field.volrend import Rendering
 from refield.scene.capture import Rays
 from refield.scene.inside import spans
-from refield.update.light import Relighting
 
 _SOME = 4  # samples of what changed that are asked for at once on a ray; a surface is about so many thick
 
@@ -99,17 +98,6 @@ class View:
         net = (base.encoding.tables, base.encoding.resolutions, base.networks)
         lines = (rays.origins, rays.directions, rays.origins.new_zeros(len(rays)))
         return lines, space, sampler.grid, sampler.lattice, net, STOP, sampler.fine
-
-
-def lights_of(lights: Sequence[Relighting]) -> Lights:
-    """One light after the other, as kernels take them; no larger than where there is any."""
-    lights = [cropped for light in lights if (cropped := light.cropped()) is not None]
-    if not lights:
-        return NO_LIGHTS
-    shapes = torch.tensor([light.log_gain.shape[:3] for light in lights])
-    firsts = torch.cat([shapes.new_zeros(1), shapes.prod(-1).cumsum(0)[:-1]])
-    boxes = torch.stack([light.aabb.float() for light in lights])
-    return Lights(boxes, shapes, firsts, torch.cat([light.log_gain.reshape(-1, 3).float() for light in lights]))
 
 
 def boxes_around(sampler: OccupancySampler, boxes: Sequence[Tensor]) -> Tensor:

@@ -23,7 +23,7 @@ from refield.scene.pose import invert, nearest_rotation, rigid, transform
 from refield.update.store import save_updated
 from refield.update.train import update_field
 from refield.visits.make import SHOWN
-from refield.visits.page import OPAQUE, page
+from refield.visits.page import page
 from refield.visits.telling import Telling
 from refield.visits.visit import Visit
 from refield.workspace import Workspace
@@ -107,5 +107,5 @@ def _compared(old: Field, new: Field, frame: Frame) -> Comparison:
     """What the two show from a photo's place."""
     camera = frame.camera.within(SHOWN)
     before, after = (render_camera(field, camera, frame.world_from_cam) for field in (old, new))
-    depths = before.surface(OPAQUE), after.surface(OPAQUE)
+    depths = before.surface(), after.surface()
     return Comparison(frame.name, None, before.rgb, after.rgb, None, None, None, frame, *depths)

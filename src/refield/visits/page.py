@@ -11,9 +11,6 @@ from refield.scene.change import SceneChange
 from refield.scene.images import frame_image
 from refield.visits.telling import Telling
 
-OPAQUE = 0.9
-"""of the light has to end in what is taken for a surface"""
-
 
 def page(
     title: str,
@@ -73,8 +70,8 @@ def _photos(
                 photo=frame_image(frame),
                 before=None if before is None else before[used].rgb,
                 after=None if after is None else after[used].rgb,
-                depth_before=None if before is None else before[used].surface(OPAQUE),
-                depth_after=None if after is None else after[used].surface(OPAQUE),
+                depth_before=None if before is None else before[used].surface(),
+                depth_after=None if after is None else after[used].surface(),
                 mask_in=change.masks_in[used] if change.masks_in else None,
                 mask_out=change.masks_out[used] if change.masks_out else None,
                 unclear=change.unexplained[used] if change.unexplained else None,
