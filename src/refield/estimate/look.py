@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refield.field.radiance import Field
-from refield.field.render import visible_samples
+from refield.field.render import CHUNK, visible_samples
 from refield.field.sampling import STOP
 from refield.field.volrend import Samples, composite, weights
 from refield.field.warp import crosses, outline
@@ -31,7 +31,6 @@ Array = NDArray[Any]
 Directed = Callable[[Tensor, Tensor], Tensor]
 """World points and directions (S, 3) -> the directions along which to ask for colours, (S, 3)."""
 
-_CHUNK = 16384
 _AT_ONCE = 12  # samples of a ray
 _NEGLIGIBLE = 1e-3  # weight of a sample whose colour is not asked for; the sum of what is lost stays below a grey level
 
@@ -91,7 +90,7 @@ def see(field: Field, rays: Rays, hidden: Hidden | None = None) -> Seen:
 
 def _see_all(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
     with torch.no_grad():
-        parts = [_see(field, rays[i : i + _CHUNK], hidden) for i in range(0, max(len(rays), 1), _CHUNK)]
+        parts = [_see(field, rays[i : i + CHUNK], hidden) for i in range(0, max(len(rays), 1), CHUNK)]
     return Seen(
         torch.cat([p.rgb for p in parts]), torch.cat([p.depth for p in parts]), torch.cat([p.opacity for p in parts])
     )

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from refield.field.kernels.reference import offsets_of
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays
 from refield.scene.exposure import vignetting_basis
@@ -42,7 +43,7 @@ class PixelBank:
         if parts is not None:
             self.places = torch.cat([p.int() for p in parts])
             counts = torch.tensor([len(p) for p in parts])
-        self.starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        self.starts = offsets_of(counts)
         """(F + 1,) int64: frame i owns pixels ``starts[i] : starts[i + 1]``, row by row"""
         self.rgb = torch.empty(int(counts.sum()), 3, dtype=torch.uint8)
         """(P, 3) uint8"""

@@ -130,12 +130,13 @@ class OccupancySampler:
         density: Callable[[Tensor], Tensor],
         boxes: Iterable[Tensor],
         threshold: float = 1e-2,
-        probes: int = 4,
+        probes: int = 8,
     ) -> OccupancySampler:
         """The same sampler with the cells that touch the world boxes (2, 3) looked up anew in ``density``.
 
-        A cell is occupied if at one of ``probes`` points a sample would have an opacity above ``threshold``; the points
-        are always the same. Of its parts nothing is known any more.
+        A cell is occupied if at one of ``probes`` points a sample would have an opacity above ``threshold``: of many,
+        since a moved surface crosses cells at any angle. They are always the same. Of the cells' parts nothing is known
+        any more.
         """
         grid, fine = self.grid.clone(), None if self.fine is None else self.fine.clone()
         for box in boxes:

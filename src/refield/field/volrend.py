@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from refield.field import kernels
 from refield.field.kernels.cpu.simd import JIT
-from refield.field.kernels.reference import seen, to_be_seen
+from refield.field.kernels.reference import offsets_of, seen, to_be_seen
 from refield.scene.capture import Rays
 from refield.scene.images import png
 
@@ -51,7 +51,7 @@ class Samples:
     def only(self, which: Tensor) -> Samples:
         """Some of them, of the same rays: rows in order, or (S,) bool."""
         counts = torch.bincount(self.ray_ids[which], minlength=len(self.ray_offsets) - 1)
-        return Samples(self.t_starts[which], self.t_ends[which], torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
+        return Samples(self.t_starts[which], self.t_ends[which], offsets_of(counts))
 
     def positions(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """World midpoints (S, 3) and directions (S, 3)."""

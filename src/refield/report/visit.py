@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import platform
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -136,11 +135,9 @@ def summary(change: SceneChange) -> str:
     if not change.objects:
         what = "Something changed that is not understood" if change.unexplained else "Nothing changed"
         return f"{what}; seen in {photos}."
-    kinds = Counter(o.kind for o in change.objects)
-    parts = ", ".join(f"{kinds[k]} {k}" for k in ("moved", "removed", "added") if kinds[k])
     n = len(change.objects)
     how = "by hand" if change.by_hand else f"seen in {photos}"
-    return f"{n} object{'' if n == 1 else 's'} changed: {parts}; {how}."
+    return f"{n} object{'' if n == 1 else 's'} changed: {change.kinds}; {how}."
 
 
 def visit_report_dict(report: VisitReport) -> dict[str, Any]:

@@ -7,10 +7,11 @@ An object is an occupancy grid (§4.2.4) in the world, a kind, and for a moved o
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -237,6 +238,12 @@ class SceneChange:
     def frames(self) -> tuple[Frame, ...]:
         """The new photos that are used, with their poses."""
         return tuple(p.frame for p in self.photos if p.frame is not None)
+
+    @property
+    def kinds(self) -> str:
+        """How many objects did what: "1 moved, 2 removed"."""
+        count = Counter(o.kind for o in self.objects)
+        return ", ".join(f"{count[kind]} {kind}" for kind in get_args(Kind) if count[kind])
 
     def among(self, placed: Sequence[PlacedPhoto]) -> SceneChange:
         """The same, with what localization said of all ``placed`` photos, of which the used ones were compared."""

@@ -7,7 +7,6 @@ cut out: nothing is left inside them.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import replace
@@ -37,7 +36,6 @@ DILATION = 2.0
 _DEPTH = 10.0  # optical depth of a sample of what changed that lies in a textured plane
 _NODES = 500  # of a grid, that are asked instead of all
 _WHOLE = 0.8  # of them must be the same move's, for an object to be the one that it moved
-_PROBES = 8  # points a cell looked up when the sampler is recomputed: a moved surface crosses cells at any angle
 
 
 class UpdatedField:
@@ -86,7 +84,7 @@ class UpdatedField:
         self.unseen: Tensor = none if before is None else before.unseen
         """flat indices of the sampler's cells that are not shown, see `unshown`"""
         if sampler is None:
-            sampler = self._without_unseen(pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES))
+            sampler = self._without_unseen(pretrained.sampler.refreshed(self.density, self.boxes))
         self._look_where(sampler)
 
     def _look_where(self, sampler: OccupancySampler) -> None:
@@ -105,14 +103,10 @@ class UpdatedField:
         return Learnt(self.helper, self.region, self.light, self.shading, self.bare)
 
     def __repr__(self) -> str:
-        return f"UpdatedField({self._changed_here}; before: {self.pretrained!r})"
-
-    @property
-    def _changed_here(self) -> str:
-        return ", ".join(f"{count} {kind}" for kind, count in Counter(o.kind for o in self.change.objects).items())
+        return f"UpdatedField({self.change.kinds}; before: {self.pretrained!r})"
 
     def _repr_html_(self) -> str:
-        rows: list[tuple[str, object]] = [("this change", self._changed_here), ("before", self.pretrained)]
+        rows: list[tuple[str, object]] = [("this change", self.change.kinds), ("before", self.pretrained)]
         rows += [("note", note) for note in (self.why_stopped, *self.notes) if note]
         pictures = []
         for frame in self.change.frames[:1]:

@@ -14,6 +14,7 @@ from refield.field import kernels
 from refield.field.descent import NonFiniteError, TableAdam
 from refield.field.kernels.reference import Aim, Batch, Fixed, Unwanted
 from refield.field.radiance import HashField
+from refield.field.render import CHUNK
 from refield.field.sampling import STOP
 from refield.field.schedule import at_plateau, rate_factor
 from refield.field.volrend import Samples, accumulate_rgb
@@ -26,7 +27,6 @@ from refield.update.region import Region
 from refield.update.supervision import Lessons
 from refield.update.unseen import Sight
 
-_CHUNK = 16384  # rays
 _RAYS = 1024, 8192  # of a step, at least and at most
 _PER_RAY = 0.5  # samples of a ray, at least, when rays are counted out for a step
 
@@ -139,7 +139,7 @@ class HelperTraining:
             best = {}  # the last steps, after the last look, were the best
         if best:
             self.helper.load_state_dict(best)
-        self.occupancy.settle()
+        self.occupancy.finish()
         return looks
 
     def psnr(self, lit: Lit) -> float:
@@ -154,7 +154,7 @@ class HelperTraining:
         self.helper.eval()
         out = []
         with torch.no_grad():
-            for chosen in torch.arange(len(lit.lessons)).split(_CHUNK):
+            for chosen in torch.arange(len(lit.lessons)).split(CHUNK):
                 woven = self._woven(lit.lessons[chosen].rays, lit.fixed[chosen])
                 out.append(accumulate_rgb(woven.weights, woven.rgb, woven.samples)[0])
         return torch.cat(out).clamp(0, 1)

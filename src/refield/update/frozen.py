@@ -15,16 +15,14 @@ import torch
 from torch import Tensor
 
 from refield.field import kernels
-from refield.field.kernels.reference import order_key, places_in_order
+from refield.field.kernels.reference import offsets_of, order_key, places_in_order
 from refield.field.radiance import Field
-from refield.field.render import visible_samples
+from refield.field.render import CHUNK, visible_samples
 from refield.field.sampling import OccupancySampler
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
 from refield.update.composite import UpdatedField
 from refield.update.ground import Foothold
-
-_CHUNK = 16384  # rays
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class Segments:
     def __getitem__(self, chosen: Tensor) -> Segments:
         """The segments of the chosen rays (B,), in their order."""
         counts = self.offsets.diff()[chosen]
-        offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        offsets = offsets_of(counts)
         within = torch.arange(int(offsets[-1])) - torch.repeat_interleave(offsets[:-1], counts)
         rows = torch.repeat_interleave(self.offsets[:-1][chosen], counts) + within
         return Segments(self.t_mid[rows], self.optical_depth[rows], self.rgb[rows], offsets)
@@ -60,7 +58,7 @@ class Segments:
         """Without what lies beyond a distance (N,) on each ray."""
         kept, ids = self.t_mid <= t[self.ray_ids], self.ray_ids
         counts = torch.bincount(ids[kept], minlength=len(t))
-        offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        offsets = offsets_of(counts)
         return Segments(self.t_mid[kept], self.optical_depth[kept], self.rgb[kept], offsets)
 
     @staticmethod
@@ -71,7 +69,7 @@ class Segments:
             torch.cat([p.t_mid for p in parts]),
             torch.cat([p.optical_depth for p in parts]),
             torch.cat([p.rgb for p in parts]),
-            torch.cat([counts.new_zeros(1), counts.cumsum(0)]),
+            offsets_of(counts),
         )
 
     @property
@@ -99,7 +97,7 @@ def composite_once(field: Field, region: OccupancySampler, rays: Rays) -> Segmen
     ``field`` must be empty inside the region, but for what stays fixed there (objects that moved in).
     """
     with torch.no_grad():
-        parts = [_composite_chunk(field, region, rays[i : i + _CHUNK]) for i in range(0, max(len(rays), 1), _CHUNK)]
+        parts = [_composite_chunk(field, region, rays[i : i + CHUNK]) for i in range(0, max(len(rays), 1), CHUNK)]
     return Segments.joined(parts)
 
 
@@ -122,7 +120,7 @@ def _composite_chunk(field: Field, region: OccupancySampler, rays: Rays) -> Segm
     opacity = summed[:, 4].clamp_min(1e-12)
     depth = tau.new_zeros(len(first)).index_add_(0, starts.cumsum(0) - 1, tau)
     counts = torch.bincount(ray[first], minlength=len(rays))
-    offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    offsets = offsets_of(counts)
     return Segments(summed[:, 3] / opacity, depth, summed[:, :3] / opacity[:, None], offsets)
 
 

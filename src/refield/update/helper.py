@@ -24,6 +24,7 @@ _SHAPE = HashFieldConfig(levels=8, coarsest=16, log2_table=15)  # of a region, a
 _FINE = 1.5  # pixels of the nearest new photo, the side of a finest cell; so many of these along the space at least and
 _FINEST = 64, 2048  # at most
 _OPACITY = 5e-2  # a cell is shown if a sample in it is more opaque than this
+_CULL_FROM = 64  # steps, from which on cells that no ray sees are left out
 _PROBES = 4  # points of a cell that are asked for it
 _WEIGHT = 5e-3  # and it or a neighbour gave some ray this much of its colour
 _RIM = 0.5  # as empty as this is the rim of what stood on a plane, and everything beneath the plane
@@ -120,30 +121,23 @@ def _band(foothold: Foothold, cell: float) -> float:
     return max(_BAND * cell, 2 * foothold.plane.noise)
 
 
-class HelperOccupancy:
+class HelperOccupancy(OccupancyTrainer):
     """The helper's occupancy grid in training: the engine's, never outside the region."""
 
-    def __init__(self, helper: HashField, draw: torch.Generator, cull_from: int = 64) -> None:
-        self.helper, self.draw = helper, draw
-        self.allowed = helper.sampler.grid.clone()
-        self.trainer = OccupancyTrainer(helper, cull_from, self.allowed.reshape(-1) > 0, doubt=0.0, draw=draw)
+    def __init__(self, helper: HashField, draw: torch.Generator) -> None:
+        super().__init__(helper, _CULL_FROM, helper.sampler.grid.reshape(-1) > 0, doubt=0.0, draw=draw)
 
-    def observe(self, step: int, cells: Tensor, w: Tensor, sigmas: Tensor) -> None:
-        """After each step: samples' cells (S,), weights (S,) and densities (S,)."""
-        self.trainer.observe(step, cells, w, sigmas)
-
-    def settle(self) -> None:
+    def finish(self) -> None:
         """The grid to show: opaque cells next to what training rays saw. Few photos see little of a surface; a view
         between them must find no holes in it."""
-        cells = self.allowed.reshape(-1).nonzero()[:, 0]
-        s = self.helper.sampler
-        self.helper.train()  # ask everywhere, not only where training looked last
+        cells, helper, s = self.allowed.nonzero()[:, 0], self.model, self.model.sampler
+        helper.train()  # ask everywhere, not only where training looked last
         with torch.no_grad():
             points = (s.points_in(cells, jitter=i > 0, draw=self.draw) for i in range(_PROBES))
-            sigma = torch.stack([self.helper.density(x) for x in points]).amax(0)
-        opaque = torch.zeros_like(self.allowed)
+            sigma = torch.stack([helper.density(x) for x in points]).amax(0)
+        opaque = torch.zeros_like(s.grid)
         opaque.view(-1)[cells] = (-torch.expm1(-sigma * s.step) > _OPACITY).to(torch.uint8)
-        seen = (self.trainer.weight > _WEIGHT).reshape(1, 1, *self.allowed.shape).float()
+        seen = (self.weight > _WEIGHT).reshape(1, 1, *s.grid.shape).float()
         near = functional.max_pool3d(seen, 5, stride=1, padding=2)[0, 0] > 0
-        self.helper.looking_where(opaque * near)
-        self.helper.eval()
+        helper.looking_where(opaque * near)
+        helper.eval()

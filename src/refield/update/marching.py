@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from refield.field.kernels.reference import offsets_of
 from refield.field.nerfacto import NerfactoField
 from refield.field.nerfstudio import NerfstudioField
 from refield.field.radiance import Field, HashField
@@ -138,7 +139,7 @@ class Marching:
         _, told = self.split
         found = replace(told, far=min(far, told.far))(rays[near], jitter)
         counts = near.new_zeros(len(rays)).index_copy(0, near, found.ray_offsets.diff())
-        return Samples(found.t_starts, found.t_ends, torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
+        return Samples(found.t_starts, found.t_ends, offsets_of(counts))
 
 
 def _by_cells(sampler: OccupancySampler, box: Tensor) -> Tensor:

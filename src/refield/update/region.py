@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from refield.field.encoding import Contraction
+from refield.field.render import CHUNK
 from refield.field.sampling import OccupancySampler
 from refield.field.warp import crossing, outline
 from refield.scene.capture import Rays
@@ -17,7 +18,6 @@ from refield.scene.change import OccupancyGrid, SceneChange
 from refield.update.textured import TexturedPlane
 
 _FINER = 0.5  # length of the samples of what changed, in samples of the old field: about a pixel in place of two
-_CHUNK = 65536  # rays
 _CELLS = 64, 160  # of a region's grid along a side, at least and, for memory, at most
 _ROOM = 1.02  # how much larger than the region's box its space is
 
@@ -113,7 +113,7 @@ def meets(sampler: OccupancySampler, rays: Rays) -> Tensor:
     space = sampler.contraction
     near, far = crossing(rays, torch.stack([space.centre - space.radius, space.centre + space.radius]))
     out = far > near  # the core cube, beyond which there is no region
-    for rows in out.nonzero()[:, 0].split(_CHUNK):
+    for rows in out.nonzero()[:, 0].split(CHUNK):
         out[rows] = sampler(rays[rows]).ray_offsets.diff() > 0
     return out
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from refield.field import kernels
 from refield.field.kernels.onward import Lights, Shown, Way, summed
-from refield.field.kernels.reference import Lattice, Networks, Rays3, Space
+from refield.field.kernels.reference import Lattice, Networks, Rays3, Space, offsets_of
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP, OccupancySampler
 from refield.field.volrend import Rendering
@@ -120,4 +120,4 @@ def _in_order(found: Sequence[tuple[Tensor, ...]], count: int) -> Shown:
     t0, t1, sigma, rgb, ids = (torch.cat(parts) for parts in zip(*found))
     order = torch.argsort(ids, stable=True)
     counts = torch.bincount(ids, minlength=count)
-    return t0[order], t1[order], sigma[order], rgb[order], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    return t0[order], t1[order], sigma[order], rgb[order], offsets_of(counts)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from refield.field.kernels import reference
-from refield.field.kernels.reference import TRACE, Lattice, Networks, Rays3, Space, truncated_exp
+from refield.field.kernels.reference import TRACE, Lattice, Networks, Rays3, Space, offsets_of, truncated_exp
 
 Shown = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 """t_starts (S,), t_ends (S,), densities (S,) per world unit, colours (S, 3), offsets (N + 1,)"""
@@ -70,7 +70,7 @@ def next_samples(
     ids = reference._ray_ids(offsets)
     kept = (t1 > enter[ids]) & (t0 < leave[ids])
     counts = torch.zeros_like(offsets[1:]).index_add(0, ids, kept.long())
-    t0, t1, offsets = t0[kept], t1[kept], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    t0, t1, offsets = t0[kept], t1[kept], offsets_of(counts)
     counts = counts.clamp(max=most)
     out = torch.full((2, len(t), most), torch.inf, device=t.device)
     for m in range(most):
@@ -124,7 +124,7 @@ def shown_on(
     counts = torch.zeros_like(offsets[1:]).index_add(0, ids, kept.long())
     way.depth.index_add_(0, ids, torch.where(kept, tau, 0.0))
     rgb = relight(mid, rgb, lights)
-    t0, t1, offsets = t0[kept], t1[kept], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    t0, t1, offsets = t0[kept], t1[kept], offsets_of(counts)
     rows = ((counts > 0) & (way.depth >= stop)).nonzero()[:, 0]
     way.t.copy_(until.index_copy(0, rows, t1[offsets[1:][rows] - 1]))
     return t0, t1, sigma[kept], rgb[kept], offsets

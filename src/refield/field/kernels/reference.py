@@ -201,6 +201,11 @@ def hash_density(unit: Tensor, net: DensityNet) -> Tensor:
         return (hash_encode(unit, tables, resolutions) @ w_in.T).relu() @ w_out
 
 
+def offsets_of(counts: Tensor) -> Tensor:
+    """How many samples each of N rays has, (N,) int64 -> where each ray's begin and the last one's end, (N + 1,)."""
+    return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+
+
 def _ray_ids(offsets: Tensor) -> Tensor:
     counts = offsets[1:] - offsets[:-1]
     return torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
@@ -265,7 +270,7 @@ def march(
     owner = torch.cat(owners)
     order = torch.argsort(owner, stable=True)
     counts = torch.bincount(owner, minlength=len(origins))
-    offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    offsets = offsets_of(counts)
     return torch.cat(starts)[order], torch.cat(ends)[order], offsets
 
 
@@ -289,7 +294,7 @@ def march_visible(
     sigma = torch.exp(hash_density((contract(x, *space) + 2) / 4, net).clamp(max=15)) / space[1]
     keep = _exclusive_sum(sigma * (t1 - t0), offsets) < stop
     counts = torch.zeros(len(offsets) - 1, dtype=torch.long, device=ids.device).index_add(0, ids, keep.long())
-    return t0[keep], t1[keep], torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    return t0[keep], t1[keep], offsets_of(counts)
 
 
 def render(
@@ -498,7 +503,7 @@ def woven_step(
     cells = _cells(unit, grid.shape[0])
     counts = fixed.offsets.diff()[fixed.chosen]
     fixed_ids = torch.repeat_interleave(counts)
-    before = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    before = offsets_of(counts)
     rows = (
         torch.arange(len(fixed_ids), device=fixed_ids.device)
         - before[fixed_ids]

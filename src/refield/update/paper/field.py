@@ -7,7 +7,6 @@ of Eq. 3 (Eqs. 4, 5). Letters: S points, N rays, K intervals a ray.
 
 from __future__ import annotations
 
-from collections import Counter
 from copy import deepcopy
 
 import torch
@@ -23,8 +22,6 @@ from refield.scene.change import SceneChange
 from refield.scene.notebook import facts
 from refield.update.paper.helper import HelperField
 from refield.update.region import Region, move_out
-
-_PROBES = 8  # points a cell that is looked up for those who march: a moved surface crosses cells at any angle
 
 
 class PaperField:
@@ -52,18 +49,14 @@ class PaperField:
         self.notes: tuple[str, ...] = ()
         """what the user should know of it, in words"""
         if sampler is None:
-            sampler = pretrained.sampler.refreshed(self.density, self.boxes, probes=_PROBES)
+            sampler = pretrained.sampler.refreshed(self.density, self.boxes)
         self.sampler: OccupancySampler = sampler
 
     def __repr__(self) -> str:
-        return f"PaperField({self._changed_here}; before: {self.pretrained!r})"
-
-    @property
-    def _changed_here(self) -> str:
-        return ", ".join(f"{count} {kind}" for kind, count in Counter(o.kind for o in self.change.objects).items())
+        return f"PaperField({self.change.kinds}; before: {self.pretrained!r})"
 
     def _repr_html_(self) -> str:
-        rows: list[tuple[str, object]] = [("this change", self._changed_here), ("before", self.pretrained)]
+        rows: list[tuple[str, object]] = [("this change", self.change.kinds), ("before", self.pretrained)]
         return facts("PaperField", rows + [("note", note) for note in (self.why_stopped, *self.notes) if note])
 
     def density(self, x: Tensor) -> Tensor:
