@@ -35,17 +35,25 @@ class Box:
     paint: int = 0
     """seed of the pattern; negative is one plain colour"""
 
+    @cached_property
+    def _box_from_world(self) -> Tensor:
+        return pose.invert(self.world_from_box)
+
+    @cached_property
+    def _waves(self) -> tuple[Tensor, Tensor]:
+        g = torch.Generator().manual_seed(self.paint)
+        return (torch.rand(3, 3, generator=g) - 0.5) * 36, torch.rand(3, generator=g) * 6
+
     def inside(self, x: Tensor) -> Tensor:
-        local = pose.transform(pose.invert(self.world_from_box), x)
-        return (local.abs() < local.new_tensor(self.half)).all(-1)
+        local = pose.transform(self._box_from_world, x).abs()
+        a, b, c = self.half
+        return (local[..., 0] < a) & (local[..., 1] < b) & (local[..., 2] < c)
 
     def colour(self, x: Tensor) -> Tensor:
-        local = pose.transform(pose.invert(self.world_from_box), x)
         if self.paint < 0:
-            return local.new_tensor([0.8, 0.2, 0.15]).expand_as(x)
-        g = torch.Generator().manual_seed(self.paint)
-        waves = (torch.rand(3, 3, generator=g) - 0.5) * 36
-        return 0.5 + 0.4 * torch.sin(local @ waves + torch.rand(3, generator=g) * 6)
+            return x.new_tensor([0.8, 0.2, 0.15]).expand_as(x)
+        waves, phases = self._waves
+        return 0.5 + 0.4 * torch.sin(pose.transform(self._box_from_world, x) @ waves + phases)
 
     def moved(self, new_from_old: Tensor) -> Box:
         return replace(self, world_from_box=new_from_old @ self.world_from_box)
@@ -62,17 +70,23 @@ class BoxWorld:
         return oracle_sampler(self.density, SPACE, STEP)
 
     def density(self, x: Tensor) -> Tensor:
-        solid = (x[..., 2] <= 0) & (x[..., 2] >= -0.08) & (x[..., :2].abs() < FLOOR).all(-1)
-        for box in self.boxes:
-            solid = solid | box.inside(x)
+        return self._density(x, [box.inside(x) for box in self.boxes])
+
+    def _density(self, x: Tensor, inside: Sequence[Tensor]) -> Tensor:
+        flat = x.detach()
+        solid = (flat[..., 2] <= 0) & (flat[..., 2] >= -0.08) & (flat[..., :2].abs().amax(-1) < FLOOR)
+        for held in inside:
+            solid = solid | held
         return torch.where(solid, 250.0, 0.0)
 
     def __call__(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        ground = x * x.new_tensor([1.0, 1.0, 0.0])
-        rgb = 0.45 + 0.2 * torch.sin(ground @ x.new_tensor([[9.0, 14, 3], [11, -7, 16], [0, 0, 0]]))
-        for box in self.boxes:
-            rgb = torch.where(box.inside(x)[..., None], box.colour(x), rgb)
-        return self.density(x), rgb
+        at = x.reshape(-1, 3)
+        rgb = 0.45 + 0.2 * torch.sin(at[:, :2] @ at.new_tensor([[9.0, 14, 3], [11, -7, 16]]))
+        inside = [box.inside(at) for box in self.boxes]
+        for box, held in zip(self.boxes, inside):
+            rows = held.nonzero()[:, 0]
+            rgb = rgb.index_copy(0, rows, box.colour(at[rows]))
+        return self._density(at, inside).reshape(x.shape[:-1]), rgb.reshape(x.shape)
 
 
 def standing(half: tuple[float, float, float], x: float, y: float, degrees: float, paint: int = 0) -> Box:

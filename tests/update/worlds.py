@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,8 +28,18 @@ class Ball:
     world_from_ball: Tensor
     radius: float
 
-    def local(self, x: Tensor) -> Tensor:
-        return pose.transform(pose.invert(self.world_from_ball), x)
+    @cached_property
+    def ball_from_world(self) -> Tensor:
+        return pose.invert(self.world_from_ball)
+
+    def inside(self, x: Tensor) -> Tensor:
+        """World points (S, 3), (S,) bool."""
+        return pose.transform(self.ball_from_world, x).norm(dim=-1) < self.radius
+
+    def colour(self, x: Tensor, d: Tensor) -> Tensor:
+        """At world points (S, 3), along directions (S, 3)."""
+        along = pose.rotate(self.ball_from_world, d)
+        return 0.5 + 0.35 * torch.sin(9 * pose.transform(self.ball_from_world, x)) + 0.1 * along
 
 
 @dataclass(frozen=True)
@@ -43,22 +54,29 @@ class BallWorld:
         return oracle_sampler(self.density, SPACE, STEP)
 
     def density(self, x: Tensor) -> Tensor:
-        return self(x, torch.zeros_like(x))[0]
+        flat = x.reshape(-1, 3)
+        return self._density(flat, [ball.inside(flat) for ball in self.balls]).reshape(x.shape[:-1])
+
+    def _density(self, x: Tensor, inside: Sequence[Tensor]) -> Tensor:
+        solid = self._floor(x)
+        for held in inside:
+            solid = solid | held
+        return torch.where(solid, 200.0, 0.0)
+
+    def _floor(self, x: Tensor) -> Tensor:
+        if not self.floor:
+            return torch.zeros(len(x), dtype=torch.bool)
+        return (x[:, 2] <= 0) & (x[:, 2] >= -0.1) & (x[:, :2].abs().amax(-1) < 1.4)
 
     def __call__(self, x: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        sigma, rgb = torch.zeros_like(x[..., 0]), torch.zeros_like(x)
-        if self.floor:
-            slab = (x[..., 2] <= 0) & (x[..., 2] >= -0.1) & (x[..., :2].abs() < 1.4).all(-1)
-            sigma = torch.where(slab, 200.0, sigma)
-            rgb = torch.where(slab[..., None], 0.5 + 0.4 * torch.sin(6 * x), rgb)
-        for ball in self.balls:
-            local = ball.local(x)
-            inside = local.norm(dim=-1) < ball.radius
-            along = pose.rotate(pose.invert(ball.world_from_ball), d)
-            colour = 0.5 + 0.35 * torch.sin(9 * local) + 0.1 * along
-            sigma = torch.where(inside, 200.0, sigma)
-            rgb = torch.where(inside[..., None], colour, rgb)
-        return sigma, rgb
+        flat, along = x.reshape(-1, 3), d.reshape(-1, 3)
+        inside = [ball.inside(flat) for ball in self.balls]
+        rows = self._floor(flat).nonzero()[:, 0]
+        rgb = torch.zeros_like(flat).index_copy(0, rows, 0.5 + 0.4 * torch.sin(6 * flat[rows]))
+        for ball, held in zip(self.balls, inside):
+            rows = held.nonzero()[:, 0]
+            rgb = rgb.index_copy(0, rows, ball.colour(flat[rows], along[rows]))
+        return self._density(flat, inside).reshape(x.shape[:-1]), rgb.reshape(x.shape)
 
 
 def at(x: float, y: float, z: float, yaw: float = 0.0) -> Tensor:
