@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from refield.evaluate import pose_error
-from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
+from refield.rehearse.matching import overlap
+from refield.scene.change import ObjectChange, SceneChange
 from refield.synthetic.worlds import Item, TrueChange, World
 
 _FOUND = 0.25  # IoU of two grids from which on they are one object
-_PROBES = 60_000  # points that a grid's IoU is measured with
 _SYMMETRIC = ("Sphere",)
 
 
@@ -60,12 +59,12 @@ def score(change: SceneChange, world: World, truth: SceneChange) -> Score:
     ``truth``: the same world's true masks on the photos that were used.
     """
     true = world.changes
-    overlap = np.array([[_iou(found, _item_of(t)) for t in true] for found in change.objects])
+    shared = np.array([[_iou(found, _item_of(t)) for t in true] for found in change.objects])
     pairs: dict[int, int] = {}
-    if overlap.size:
-        pairs = {int(t): int(f) for f, t in zip(*linear_sum_assignment(-overlap)) if overlap[f, t] > _FOUND}
+    if shared.size:
+        pairs = {int(t): int(f) for f, t in zip(*linear_sum_assignment(-shared)) if shared[f, t] > _FOUND}
     objects = tuple(
-        _found(t, change.objects[pairs[k]] if k in pairs else None, overlap[pairs[k], k] if k in pairs else 0.0)
+        _found(t, change.objects[pairs[k]] if k in pairs else None, shared[pairs[k], k] if k in pairs else 0.0)
         for k, t in enumerate(true)
     )
     alarms = len(change.objects) - len(pairs)
@@ -99,15 +98,6 @@ def _is_symmetric(item: Item) -> bool:
 
 def _iou(found: ObjectChange, item: Item) -> float:
     return overlap(found.grid, item.box().float(), lambda x: item.distance(x.double()) < 0)
-
-
-def overlap(grid: OccupancyGrid, box: Tensor, inside: Callable[[Tensor], Tensor]) -> float:
-    """IoU of what a grid holds and another shape: ``inside`` says of points (N, 3) whether they are in it, and its
-    ``box`` (2, 3) holds all of it."""
-    lo, hi = torch.minimum(grid.tight_aabb()[0], box[0]), torch.maximum(grid.tight_aabb()[1], box[1])
-    x = lo + (hi - lo) * torch.rand(_PROBES, 3, generator=torch.Generator().manual_seed(0))
-    a, b = grid.contains(x), inside(x)
-    return float((a & b).sum() / (a | b).sum().clamp_min(1))
 
 
 def pooled_iou(a: Sequence[Tensor], b: Sequence[Tensor]) -> float | None:

@@ -12,6 +12,7 @@ from types import ModuleType
 import pytest
 import torch
 
+from refield.rehearse.matching import matched
 from refield.scene.change import ObjectChange, OccupancyGrid
 from refield.scene.errors import InputError
 from refield.scene.files import read_json
@@ -45,13 +46,12 @@ def box(kind: str, x: float, to: float | None = None) -> ObjectChange:
     return ObjectChange(kind, grid, None if to is None else motion)  # type: ignore[arg-type]
 
 
-def test_objects_are_matched_by_place(part) -> None:
-    match = part("match")
+def test_objects_are_matched_by_place() -> None:
     true = [box("moved", 0.0, 2.0), box("removed", -2.0)]
-    right = match.matched([box("removed", -2.05), box("moved", 0.05, 2.0)], true)
+    right = matched([box("removed", -2.05), box("moved", 0.05, 2.0)], true)
     assert (right.pairs, right.pieces, right.false) == ({0: 1, 1: 0}, (), ())
     # what moved taken for one that left and one that came: one of them is it, the other a piece; far off is false
-    split = match.matched([box("removed", 0.0), box("added", 2.0), box("added", 5.0)], true)
+    split = matched([box("removed", 0.0), box("added", 2.0), box("added", 5.0)], true)
     assert list(split.pairs) == [0] and split.missed(len(true)) == 1
     assert len(split.pieces) == 1 and split.false == (2,)
 

@@ -14,8 +14,9 @@ from PIL import Image
 from tables.tiles import GAP, SIDE, masks_of, tile, write_picture
 
 from gauntlet.chain import Chain, Ran, failure
-from gauntlet.match import Row, matched, pose_row, true_objects
+from gauntlet.match import Row, pose_row, true_objects
 from gauntlet.trials import Trial, make
+from refield.rehearse.matching import matched
 from refield.scene.capture import Frame, centres
 from refield.scene.change import ObjectChange, SceneChange
 from refield.scene.change_files import NAME, load_change

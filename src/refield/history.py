@@ -5,7 +5,6 @@ Every visit that changed something wraps the field before it; an updated field i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,8 +21,7 @@ from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
 from refield.scene.images import frame_image, scaled_image, write_image
-from refield.update.composite import UpdatedField, source_of
-from refield.update.paper.field import PaperField
+from refield.update.composite import UpdatedField, layers_of, source_of
 from refield.update.store import load_updated
 from refield.workspace import Workspace
 
@@ -56,28 +54,19 @@ def known_objects(now: Field) -> list[Known]:
 
 def _grids_now(now: Field) -> list[OccupancyGrid]:
     """Of all objects that visits found, where they are."""
-    if not isinstance(now, UpdatedField | PaperField):
-        return []
-    known = _grids_now(now.pretrained)
-    for o in now.change.objects:
-        known = [k for k in known if not _holds_middle(k, o.grid)]
-    for o in now.change.objects:
-        there = o.grid_now
-        # one that is known to stand there is the same: the visit took back the move that had led away from there
-        if there is not None and not any(_holds_middle(k, there) for k in known):
-            known.append(there)
+    known: list[OccupancyGrid] = []
+    for update in reversed(list(layers_of(now))):
+        objects = update.change.objects
+        known = [k for k in known if not any(_holds_middle(k, o.grid) for o in objects)]
+        for there in (o.grid_now for o in objects):
+            # one that is known to stand there is the same: the visit took back the move that had led away from there
+            if there is not None and not any(_holds_middle(k, there) for k in known):
+                known.append(there)
     return known
 
 
 def _holds_middle(grid: OccupancyGrid, other: OccupancyGrid) -> bool:
     return bool(grid.contains(other.tight_aabb().mean(0)))
-
-
-def _layers(now: Field) -> Iterator[UpdatedField | PaperField]:
-    """The updates that a field has had by either route, the latest first."""
-    while isinstance(now, UpdatedField | PaperField):
-        yield now
-        now = now.pretrained
 
 
 def retouched(capture: Capture, now: Field, folder: Path) -> Capture:
@@ -86,7 +75,7 @@ def retouched(capture: Capture, now: Field, folder: Path) -> Capture:
     The photos are from before any visit; an update must not learn from them what an earlier one has put right. Each is
     written as a PNG into ``folder`` when it is first looked at: few are, where every object is known.
     """
-    updates = list(_layers(now))
+    updates = list(layers_of(now))
     shapes = tuple(box for update in updates for box in update.boxes)
     lights = tuple(u.light.aabb for u in updates if isinstance(u, UpdatedField) and u.light is not None)
     if not shapes and not lights:

@@ -27,6 +27,7 @@ from refield.scene.pose import rotate
 from refield.update.cells import Cells, cells_of
 from refield.update.learnt import NOTHING_EARLIER, NOTHING_LEARNT, NOTHING_TAKEN, Earlier, Learnt, TakenBack
 from refield.update.marching import Marching
+from refield.update.paper.field import PaperField
 from refield.update.region import Region, carved, finer, move_out
 from refield.update.routing import SKIN, Routing
 
@@ -258,9 +259,9 @@ def source_of(field: Field, grid: OccupancyGrid) -> Source | None:
     return replace(found, now_from_then=pose @ found.now_from_then, lights=lights)
 
 
-def layers_of(field: Field) -> Iterator[UpdatedField]:
-    """The updates that a field has had, the latest first."""
-    while isinstance(field, UpdatedField):
+def layers_of(field: Field) -> Iterator[UpdatedField | PaperField]:
+    """The updates that a field has had, by either route, the latest first."""
+    while isinstance(field, UpdatedField | PaperField):
         yield field
         field = field.pretrained
 

@@ -7,6 +7,7 @@ outermost is 0.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -39,7 +40,7 @@ def earlier_of(field: Field, change: SceneChange, dilation: float) -> tuple[Fiel
     for k, o in enumerate(change.objects):
         brought = None if o.kind == "added" or k in {u.object for u in undone} else _brought(base, o.grid)
         if brought is not None:
-            left.append(Origin(k, *brought))
+            left.append(Origin(k, *brought[:2]))
     places = move_out(replace(change, objects=tuple(change.objects[p.object] for p in left)), dilation)
     ground = ground_of(base, tuple(left))
     return base, Earlier(tuple(undone), tuple(left), places, ground, _unknown(ground))
@@ -49,7 +50,7 @@ def _unknown(field: Field | None) -> Region:
     """Where something stood while every helper learnt, at a place that the fitted field does not know either."""
     grids: list[OccupancyGrid] = []
     for update in () if field is None else layers_of(field):
-        if not update.untaught.grids:
+        if not isinstance(update, UpdatedField) or not update.untaught.grids:
             continue
         was = carved(update.change, _TAUGHT * update.pretrained.sampler.step)
         for stood in update.untaught.grids:
@@ -110,14 +111,24 @@ def without(field: Field, origin: Origin, *, departed: bool) -> Field:
     return field.but(learnt=learnt, earlier=earlier, taken=replace(field.taken, skipped=skipped))
 
 
-def _brought(field: Field, place: OccupancyGrid) -> tuple[int, int] | None:
-    """The layer and index of the object that an earlier change brought to a place."""
+def _changed(field: Field) -> Iterator[tuple[int, int, ObjectChange]]:
+    """What changed before and was not taken back, with its layer and index, the latest change first."""
     for layer, update in enumerate(layers_of(field)):
-        for i, o in enumerate(update.change.objects):
-            there = None if i in update.skipped else o.grid_now
-            if there is not None and _part_in(place, there) > _SAME:
-                return layer, i
-    return None
+        if not isinstance(update, UpdatedField):
+            return
+        yield from ((layer, i, o) for i, o in enumerate(update.change.objects) if i not in update.skipped)
+
+
+def _brought(field: Field, place: OccupancyGrid) -> tuple[int, int, ObjectChange] | None:
+    """The object that an earlier change brought to a place, with its layer and index."""
+    came = (c for c in _changed(field) if (now := c[2].grid_now) is not None and _part_in(place, now) > _SAME)
+    return next(came, None)
+
+
+def _removed_from(field: Field, place: OccupancyGrid) -> tuple[int, int, ObjectChange] | None:
+    """The object that an earlier change took from a place, likewise."""
+    gone = (c for c in _changed(field) if c[2].kind == "removed")
+    return next((c for c in gone if min(_part_in(place, c[2].grid), _part_in(c[2].grid, place)) > _SAME), None)
 
 
 def _taken_back(field: Field, k: int, o: ObjectChange) -> tuple[list[Origin], Field]:
@@ -126,12 +137,12 @@ def _taken_back(field: Field, k: int, o: ObjectChange) -> tuple[list[Origin], Fi
     """
     if o.kind == "added":
         found = _removed_from(field, o.grid)
-        steps = [] if found is None else [Origin(k, *found)]
+        steps = [] if found is None else [Origin(k, *found[:2])]
         return steps, without(field, steps[0], departed=False) if steps else field
     steps, base, at, total = [], field, o.grid, o.new_from_old
     while (found := _brought(base, at)) is not None:
-        q = _object(base, *found)
-        steps.append(Origin(k, *found))
+        layer, index, q = found
+        steps.append(Origin(k, layer, index))
         base = without(base, steps[-1], departed=False)
         if q.new_from_old is None:
             return (steps, base) if o.kind == "removed" else ([], field)
@@ -147,19 +158,6 @@ def _near_identity(new_from_old: Tensor, grid: OccupancyGrid, step: float) -> bo
     off = (transform(new_from_old, corners) - corners).norm(dim=-1)
     box = grid.tight_aabb()
     return float(off.max()) < max(_BACK * float((box[1] - box[0]).mean()), 2 * step)
-
-
-def _removed_from(field: Field, place: OccupancyGrid) -> tuple[int, int] | None:
-    for layer, update in enumerate(layers_of(field)):
-        for i, o in enumerate(update.change.objects):
-            here = o.kind == "removed" and i not in update.skipped
-            if here and min(_part_in(place, o.grid), _part_in(o.grid, place)) > _SAME:
-                return layer, i
-    return None
-
-
-def _object(field: Field, layer: int, index: int) -> ObjectChange:
-    return list(layers_of(field))[layer].change.objects[index]
 
 
 def _part_in(grid: OccupancyGrid, other: OccupancyGrid) -> float:
