@@ -19,6 +19,15 @@ HERE = {**os.environ, "PYTHONPATH": os.pathsep.join(str(Path(p).resolve()) for p
 """The environment of a process that imports what this one imports."""
 
 
+@pytest.fixture(scope="session", autouse=True)
+def coarse_cells():
+    """Fits of a moment look into 64³ cells in place of 128³: making these and looking them through is most of what they
+    take. What is begun as a process of its own, and `tests/chain`, has the usual cells."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("refield.field.placing.RESOLUTION", 64)
+        yield
+
+
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory):
     """``data/`` (a capture), ``new/`` (four posed photos of the same scene) and ``work/`` (trained on it).

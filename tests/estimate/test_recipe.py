@@ -60,6 +60,22 @@ def test_a_moved_box_is_found_with_its_pose_shape_and_masks(old, tmp_path):
     assert len(change.masks_in) == 4 and change.frames[0].name == "000.png"
 
 
+def test_the_papers_masks_can_take_the_place_of_ours(old, tmp_path):
+    true = turn(centre(CRATE), 50, (0.35, -0.15, 0))
+    photos = new_photos(BoxWorld((CRATE.moved(true), DRUM)), tmp_path)
+    asked = []
+
+    class Asked(GrabCutSegmenter):
+        def features(self, image):
+            asked.append(image)
+            return super().features(image)
+
+    config = EstimateConfig(survey=6, masks="paper")
+    (moved,) = estimate_change(old, BEFORE, photos, config, models=Models(segmenter=Asked())).objects
+    assert len(asked) == 2 * (len(photos) + config.survey)  # pictures of both kinds, which ours does not ask about
+    assert moved.kind == "moved" and float(angle_between(moved.new_from_old, true)) < 1.5
+
+
 def test_a_box_tipped_onto_another_face_is_found(old, tmp_path):
     true = turn(centre(CRATE), 90, (0.3, -0.2, -0.01), axis=(0, 1, 0))
     (moved,) = estimate(old, BoxWorld((CRATE.moved(true), DRUM)), tmp_path).objects

@@ -24,6 +24,7 @@ from refield.estimate.models import ModelConfig, Models
 from refield.estimate.objects import Old
 from refield.estimate.outline import ObjectConfig, Seeds, outline, remembered
 from refield.estimate.paper.config import PaperConfig
+from refield.estimate.paper.detect import detect as detect_paper
 from refield.estimate.paper.route import estimate_change_paper
 from refield.estimate.place import PlaceConfig, place
 from refield.estimate.pose_change import RefineConfig
@@ -52,6 +53,9 @@ class EstimateConfig:
     """if more of the photos' pixels changed, they do not show this scene"""
     place: PlaceConfig = field(default_factory=PlaceConfig)
     """the new photos' poses"""
+    masks: Literal["refield", "paper"] = "refield"
+    """whose step says which pixels changed: refield's (``detect``), or the paper's (``paper.detect``) with all that
+    follows it refield's"""
     detect: DetectConfig = field(default_factory=DetectConfig)
     """change masks"""
     hull: HullConfig = field(default_factory=HullConfig)
@@ -169,9 +173,20 @@ def _detected(
         used = [v for v, p in zip(views, photos) if p.status == "used"]
         changed = detect.changes(used, errors, config.detect)
     survey = [s.view for s in errors.shown]
+    if config.masks == "paper":
+        changed = _as_the_paper_sees(changed, survey, config, models)
     planes = _planes(survey, changed)
     changed = light.set_light_aside(changed, planes, config.detect)
     return _Scene(capture, field, config, tuple(survey), errors, tuple(changed), photos, planes, models, ())
+
+
+def _as_the_paper_sees(
+    changed: Sequence[Changed], survey: Sequence[View], config: EstimateConfig, models: Models
+) -> list[Changed]:
+    """The same views with what the paper's step masks in them, whether it came or left."""
+    found = detect_paper([c.view for c in changed], survey, models.segmenter, config.paper.detect)
+    masks = [np.any([np.zeros(c.view.shape, bool), *m.move_in, *m.move_out], axis=0) for c, m in zip(changed, found)]
+    return [replace(c, mask=mask, new=c.new & ~mask) for c, mask in zip(changed, masks)]
 
 
 def _placed(field: Field, frame: Frame, config: EstimateConfig) -> View:

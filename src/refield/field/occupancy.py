@@ -17,6 +17,7 @@ EVERY, _OFTEN_UNTIL = 16, 512  # steps between renewals of the grid; later every
 _OPACITY = 5e-2  # a cell is kept if a sample in it would be more opaque than this
 _WEIGHT = 5e-3  # and if some ray gives it at least this much of its colour: hidden cells cost half of all samples
 DECAY = 0.8
+_LAST, _EACH = 200_000, 4  # rays that say at the end what is seen, at most, and for each pixel
 _PROBED_AT_FIRST, _PROBED = 16, 64  # one in so many cells, each time
 # Core radii; from the core to here cameras stand (see `place_contraction`). What is there must show itself: with the
 # benefit of the doubt a photo's background is learnt as haze before the cameras opposite, and new views meet it
@@ -135,7 +136,7 @@ class OccupancyTrainer:
         grid = kernels.keep(self.state, allowed, opacity, weight, only_seen)
         return grid.reshape(self.model.sampler.grid.shape)
 
-    def settle(self, pixels: PixelBank, rays: int = 200_000) -> None:
+    def settle(self, pixels: PixelBank) -> None:
         """The final grid: every opaque cell that some training ray sees, without the parts that are known to be empty.
 
         Leaves the model in training mode.
@@ -148,7 +149,7 @@ class OccupancyTrainer:
                 self.state[cells, 0] = torch.maximum(self.state[cells, 0], self._probe(cells))
         self._show(self._kept(-1.0, False))
         self.state[:, 1] = torch.where(self.state[:, 3] >= 0, self.state[:, 1], 0)
-        for chosen in torch.randint(len(pixels), (rays,)).split(CHUNK):
+        for chosen in torch.randint(len(pixels), (min(_LAST, _EACH * len(pixels)),)).split(CHUNK):
             r = pixels.rays(chosen)
             with torch.no_grad():
                 samples = self.model.samples(r, jitter=True)
