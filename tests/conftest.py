@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from refield.cli import main
+from refield.field.sampling import RESOLUTION
 from tests.browser import CHROMIUM
 from tests.captures import write_capture
 from tests.photos.reconstructed import reconstructed as reconstructed
@@ -25,6 +26,14 @@ def coarse_cells():
     take. What is begun as a process of its own, and `tests/chain`, has the usual cells."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("refield.field.placing.RESOLUTION", 64)
+        yield
+
+
+@pytest.fixture(scope="module")
+def usual_cells():
+    """For a file whose tests heed what the cells hold, or tenths of a dB: it names this before all its fixtures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("refield.field.placing.RESOLUTION", RESOLUTION)
         yield
 
 

@@ -31,6 +31,7 @@ TINY = FitConfig(
     field=HashFieldConfig(levels=6, finest=64, log2_table=12),
     finest_auto=False,
 )
+pytestmark = pytest.mark.usefixtures("usual_cells")
 OLD, NEW = at(-0.3, 0.2, 0.25), at(0.4, -0.3, 0.25)
 BEFORE, AFTER = BallWorld((Ball(OLD, 0.25),)), BallWorld((Ball(NEW, 0.25),))
 
