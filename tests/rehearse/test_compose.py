@@ -1,6 +1,7 @@
 """Objects put into photos of a scene whose field is known: they stand on its floor, are hidden by it, and are told."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from refield.synthetic.random_textures import PATTERNS
 from refield.synthetic.state import State
 
 CAMERA = Camera(72, 64, 70.0, 70.0, 36.0, 32.0, k1=0.05)
-COUNT = 24
+COUNT = 20
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,18 @@ def scenery(tmp_path_factory):
         write_image(path, render_camera(field, CAMERA, pose).rgb)
         frames.append(Frame(path, CAMERA, path.name, pose))
     return scenery_of(field, Capture(tuple(frames)))
+
+
+@pytest.fixture(scope="module")
+def rehearsed(scenery, tmp_path_factory):
+    """A rehearsal's folder and plan by its seed, each composed once."""
+
+    @cache
+    def of(seed):
+        folder = tmp_path_factory.mktemp(f"seed_{seed}")
+        return folder, compose(scenery, folder, seed)
+
+    return of
 
 
 def test_the_photos_are_divided(scenery):
@@ -73,10 +86,10 @@ def test_photos_of_nothing_but_a_floor_show_one_plane(scenery):
 
 
 @pytest.mark.parametrize("seed", range(len(HAPPENINGS)))
-def test_what_happens_is_what_is_told(scenery, tmp_path, seed):
-    plan = compose(scenery, tmp_path, seed)
-    before, after = load_transforms(tmp_path / "before"), load_transforms(tmp_path / "after")
-    truth = load_change(tmp_path / "truth", before)
+def test_what_happens_is_what_is_told(rehearsed, seed):
+    folder, plan = rehearsed(seed)
+    before, after = load_transforms(folder / "before"), load_transforms(folder / "after")
+    truth = load_change(folder / "truth", before)
     assert len(before.frames) == COUNT - 8 and len(after.frames) == 4
     assert before.frames[0].camera == CAMERA
     kinds, happening = [o.kind for o in truth.objects], HAPPENINGS[seed]
@@ -91,10 +104,10 @@ def test_what_happens_is_what_is_told(scenery, tmp_path, seed):
         assert abs(lowest) < 0.04, "it stands on the floor"
 
 
-def test_the_old_photos_change_only_by_the_objects(scenery, tmp_path):
-    compose(scenery, tmp_path, 0)
-    before = load_transforms(tmp_path / "before")
-    truth = load_change(tmp_path / "truth", before)
+def test_the_old_photos_change_only_by_the_objects(scenery, rehearsed):
+    folder, _ = rehearsed(0)
+    before = load_transforms(folder / "before")
+    truth = load_change(folder / "truth", before)
     shown = [m.float().mean() for m in truth.objects[0].masks]
     assert sum(m > 0.005 for m in shown) >= len(shown) / 3
     for frame, was, mask in zip(before.train, _train(scenery, before), truth.objects[0].masks):
@@ -107,12 +120,12 @@ def _train(scenery, before):
     return [frame_image(photos[f.name]) for f in before.train]
 
 
-def test_the_masks_and_depths_of_the_new_photos(scenery, tmp_path):
-    plan = compose(scenery, tmp_path, 0)
+def test_the_masks_and_depths_of_the_new_photos(rehearsed):
+    folder, plan = rehearsed(0)
     seen = 0
-    for frame in load_transforms(tmp_path / "eval").frames:
-        now = read_mask(tmp_path / "eval" / "masks_in" / frame.path.name)
-        depth = np.load(tmp_path / "eval" / "depth" / f"{frame.path.stem}.npz")["depth"]
+    for frame in load_transforms(folder / "eval").frames:
+        now = read_mask(folder / "eval" / "masks_in" / frame.path.name)
+        depth = np.load(folder / "eval" / "depth" / f"{frame.path.stem}.npz")["depth"]
         away = float((plan.world.after.items[0].world_from_item[:3, 3] - frame.centre).norm())
         reach = 2 * max(plan.world.after.items[0].solid.half)
         assert (np.abs(depth[now.numpy()] - away) < reach).all()
@@ -120,10 +133,9 @@ def test_the_masks_and_depths_of_the_new_photos(scenery, tmp_path):
     assert seen > 100
 
 
-def test_the_same_seed_makes_the_same_photos(scenery, tmp_path):
-    for name in ("a", "b"):
-        compose(scenery, tmp_path / name, 2)
-    a, b = (read_image(tmp_path / n / "before" / "images" / "0003.png") for n in ("a", "b"))
+def test_the_same_seed_makes_the_same_photos(scenery, rehearsed, tmp_path):
+    compose(scenery, tmp_path, 2)
+    a, b = (read_image(folder / "before" / "images" / "0003.png") for folder in (tmp_path, rehearsed(2)[0]))
     assert torch.equal(a, b)
 
 
