@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from refield.field.coverage import beside, knowable
+from refield.field.coverage import beside
 from refield.field.descent import FADE_EVERY, MOST_SKIPPED, NonFiniteError, fading
 from refield.field.encoding import Contraction
 from refield.field.fit import (
@@ -50,7 +50,7 @@ def fit_on_gpu(
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row.
     """
     home, device = model.encoding.tables.device, torch.device("cuda", torch.cuda.current_device())
-    known = knowable(model.sampler, photos.train).to(device), beside(model.sampler, photos.train).to(device)
+    known = photos.knowable(model.sampler).to(device), beside(model.sampler, photos.train).to(device)
     outside = stand_outside(model.contraction, photos.train)
     move(model, device)
     try:
@@ -80,7 +80,7 @@ class _GpuFit:
         places: tuple[tuple[torch.Tensor, torch.Tensor], bool],
         told: tuple[ProgressCallback | None, StepCallback | None],
     ) -> None:
-        """``places``: cells that are `knowable`, and those `beside` cameras; whether these `stand_outside`."""
+        """``places``: cells that are `Photos.knowable`, and those `beside` cameras; whether these `stand_outside`."""
         (allowed, near), outside = places
         self.on_progress, self.on_step = told
         self.model, self.config = model, config
