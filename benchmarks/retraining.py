@@ -20,7 +20,7 @@ import torch
 from estimate import Bench
 from record import Row, markdown
 from tables import paper
-from tables.again import ROWS, Case, seen, seen_new
+from tables.again import ANEW, ROWS, Case, seen, seen_new
 from tables.kept import Kept, Record, spread
 
 from refield.baselines.curve import Point
@@ -63,7 +63,8 @@ def _options() -> argparse.Namespace:
 def _run(bench: Bench, world: str, seed: int, name: str) -> Record:
     scene = bench.scene(world)
     case = Case(scene, seed, scene.truth(scene.new))
-    case.take_anew(bench.spp)
+    if name in ANEW:
+        case.take_anew(bench.spp)
     began = time.process_time()
     field, more = ROWS[name][1](case)
     seconds = time.process_time() - began

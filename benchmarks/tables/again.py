@@ -199,3 +199,5 @@ ROWS: dict[str, tuple[str, Callable[[Case], tuple[Field, Record]]]] = {
     "anew": ("all photos taken anew", _anew),
 }  # fmt: skip
 """key -> title, and how it is made"""
+ANEW = ("without_shadows", "anew")
+"""rows that need all old photos taken again"""

@@ -46,11 +46,12 @@ def on_ground(world: World, ground: Ground, seed: int) -> World:
             raise InputError(f"the world {world.name}", f"its {item.name} does not stand on the floor", "leave it flat")
     rng = world_rng(seed, f"{world.name} {ground}")
     new = (_wavy(rng),) if ground == "wavy" else _cluttered(rng, [item.box()[:, :2] for item in standing_on_it])
-    states = (
-        replace(s, items=(*new, *(_let_down(i, new, leaning=ground == "wavy") for i in s.items[1:])))
+    leaning = ground == "wavy"
+    before, after = (
+        replace(s, items=(*new, *(_let_down(i, new, leaning=leaning) for i in s.items[1:])))
         for s in (world.before, world.after)
     )
-    return World(f"{world.name}-{ground}", *states, world.target)
+    return World(f"{world.name}-{ground}", before, after, world.target)
 
 
 def _wavy(rng: np.random.Generator) -> Item:
