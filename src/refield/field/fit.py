@@ -278,11 +278,15 @@ class _Fit:
             with compiling() as self.compiling:
                 self._steps(may_give_up)
         except NonFiniteError:
-            self.occupancy.settle(self.pixels)
+            self._settle()
             raise
-        self.occupancy.settle(self.pixels)
+        self._settle()
         if self.on_progress:
             self._look(self.steps_done)
+
+    def _settle(self) -> None:
+        self.occupancy.settle(self.pixels)
+        self.model.sampler = self.model.sampler.for_pictures()
 
     def _steps(self, may_give_up: bool) -> None:
         looks: list[float] = []

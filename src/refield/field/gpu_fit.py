@@ -106,10 +106,14 @@ class _GpuFit:
         try:
             samples = self._steps()
         except NonFiniteError:
-            self.occupancy.settle(self.pixels)  # type: ignore[arg-type]
+            self._settle()
             raise
-        self.occupancy.settle(self.pixels)  # type: ignore[arg-type]
+        self._settle()
         self._look(self.step, samples / self.rays_per_step)
+
+    def _settle(self) -> None:
+        self.occupancy.settle(self.pixels)  # type: ignore[arg-type]
+        self.model.sampler = self.model.sampler.for_pictures()
 
     def _steps(self) -> int:
         """All rounds of steps, each followed by what a graph cannot hold; returns the samples of the last step."""
