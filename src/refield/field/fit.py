@@ -181,8 +181,7 @@ def fit_capture(
         model = new_field(capture, config, seed, core) if start is None else opened(start)
         try:
             if config.device == "cuda":
-                _fit_on_gpu(model, photos, config, on_progress, on_step)
-                found = capture
+                found = _fit_on_gpu(model, capture, photos, config, on_progress, on_step)
             else:
                 may_give_up = start is None and attempt < _TRIES - 1
                 run = _Fit(model, photos, config, on_progress, on_step, began=began, goes_on=goes_on)
@@ -216,15 +215,16 @@ def _core(capture: Capture) -> Contraction:
 
 def _fit_on_gpu(
     model: HashField,
+    capture: Capture,
     photos: Photos,
     config: FitConfig,
     on_progress: ProgressCallback | None,
     on_step: StepCallback | None,
-) -> None:
+) -> Capture:
     need_device(config.device)
     from refield.field.gpu_fit import fit_on_gpu
 
-    fit_on_gpu(model, photos, config, on_progress, on_step)
+    return fit_on_gpu(model, capture, photos, config, on_progress, on_step)
 
 
 def need_device(device: str) -> None:
