@@ -18,9 +18,10 @@ from refield.field.fit import FitConfig, FitProgress, _Fit, fit_field
 from refield.field.memory import memory_of
 from refield.field.photos import HeldOut, Photos, Since
 from refield.field.pixels import PixelBank
-from refield.field.placing import place_contraction
+from refield.field.placing import opened, place_contraction
 from refield.field.radiance import HashField, HashFieldConfig
-from refield.field.render import render_frame
+from refield.field.render import render_frame, render_many, render_rays
+from refield.field.sampling import IN_PICTURES
 from refield.field.schedule import at_plateau, rate_factor
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
@@ -71,6 +72,30 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 def fitted(capture: Capture) -> tuple[HashField, list[FitProgress]]:
     looks: list[FitProgress] = []
     return fit_field(capture, TINY, looks.append), looks
+
+
+def test_pictures_have_shorter_samples_than_a_fit(fitted: tuple[HashField, list[FitProgress]]) -> None:
+    field, _ = fitted
+    assert field.sampler.per_step == IN_PICTURES > 1
+    assert field.sampler.lattice[2] == field.sampler.step / IN_PICTURES
+    tensors, facts = field.state()
+    assert HashField.from_state(tensors, facts).sampler.per_step == IN_PICTURES
+    facts["sampler"].pop("per_step")  # as written by older versions
+    assert HashField.from_state(tensors, facts).sampler.lattice[2] == field.sampler.step
+    assert opened(field).sampler.per_step == 1  # a fit that goes on
+
+
+def test_shorter_samples_are_nearer_to_the_mean_over_where_samples_lie(
+    capture: Capture, fitted: tuple[HashField, list[FitProgress]]
+) -> None:
+    field = HashField.from_state(*fitted[0].state())
+    rays = camera_rays(CAMERA, capture.held_out[0].world_from_cam)
+    short = render_many(field, rays).rgb
+    field.sampler = replace(field.sampler, per_step=1.0)
+    torch.manual_seed(4)
+    with torch.no_grad():
+        mean = torch.stack([render_rays(field, rays, jitter=True).rgb for _ in range(16)]).mean(0)
+    assert (short - mean).square().mean() < 0.8 * (render_many(field, rays).rgb - mean).square().mean()
 
 
 def test_held_out_views_are_explained(capture: Capture, fitted: tuple[HashField, list[FitProgress]]) -> None:

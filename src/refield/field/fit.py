@@ -183,8 +183,7 @@ def fit_capture(
         model = new_field(capture, config, seed, core) if start is None else opened(start)
         try:
             if config.device == "cuda":
-                _fit_on_gpu(model, photos, config, on_progress, on_step)
-                found = capture
+                found = _fit_on_gpu(model, capture, photos, config, on_progress, on_step)
             else:
                 may_give_up = start is None and attempt < _TRIES - 1
                 run = _Fit(model, photos, config, on_progress, on_step, began=began, goes_on=goes_on)
@@ -218,17 +217,18 @@ def _core(capture: Capture) -> Contraction:
 
 def _fit_on_gpu(
     model: HashField,
+    capture: Capture,
     photos: Photos,
     config: FitConfig,
     on_progress: ProgressCallback | None,
     on_step: StepCallback | None,
-) -> None:
+) -> Capture:
     need_device(config.device)
     if not config.directions or photos.since.share is not None:
         raise InputError("device cuda", "draws all pixels alike, in colours that depend on the direction", "fit on cpu")
     from refield.field.gpu_fit import fit_on_gpu
 
-    fit_on_gpu(model, photos, config, on_progress, on_step)
+    return fit_on_gpu(model, capture, photos, config, on_progress, on_step)
 
 
 def need_device(device: str) -> None:
@@ -284,11 +284,15 @@ class _Fit:
             with compiling() as self.compiling:
                 self._steps(may_give_up)
         except NonFiniteError:
-            self.occupancy.settle(self.pixels)
+            self._settle()
             raise
-        self.occupancy.settle(self.pixels)
+        self._settle()
         if self.on_progress:
             self._look(self.steps_done)
+
+    def _settle(self) -> None:
+        self.occupancy.settle(self.pixels)
+        self.model.sampler = self.model.sampler.for_pictures()
 
     def _steps(self, may_give_up: bool) -> None:
         looks: list[float] = []

@@ -128,14 +128,21 @@ class HeldOut:
         """What has become known of the photos' lenses, of each one's as it is now, and of their vignetting (F, 3)."""
         if self.rays is None:
             return
-        device, directions = self.rays.origins.device, torch.empty(len(self._places), 3)
-        for i, (frame, camera) in enumerate(zip(self.frames, cameras)):
-            mine = self.owner == i
-            place = self._places[mine]
-            pixels = torch.stack([place % camera.width, place // camera.width], -1) + 0.5
-            directions[mine] = camera_rays(camera, frame.world_from_cam, pixels).directions
-        self.rays = Rays(self.rays.origins, directions.to(device))
-        self._fallen = (vignetting[self.owner] * self._basis).sum(-1, keepdim=True).exp()
+        owner = self.owner.cpu()
+        with torch.device("cpu"):
+            directions = torch.empty(len(self._places), 3)
+            for i, (frame, camera) in enumerate(zip(self.frames, cameras)):
+                place = self._places[owner == i]
+                pixels = torch.stack([place % camera.width, place // camera.width], -1) + 0.5
+                directions[owner == i] = camera_rays(camera, frame.world_from_cam, pixels).directions
+        self.rays = Rays(self.rays.origins, directions.to(self.rays.origins))
+        self._fallen = (vignetting.cpu()[owner] * self._basis).sum(-1, keepdim=True).exp()
+
+    def move(self, device: torch.device) -> None:
+        """To where the field is that is judged."""
+        if self.rays is not None:
+            self.rays = Rays(self.rays.origins.to(device), self.rays.directions.to(device))
+            self.truth, self.owner, self.left = (t.to(device) for t in (self.truth, self.owner, self.left))
 
     def psnr(self, model: Field, exposed: bool = False) -> float:
         """dB over the pixels; NaN if there are none. ``exposed``: the photos' exposures are not known: each one's is
