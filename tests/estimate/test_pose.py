@@ -11,7 +11,8 @@ from scipy import ndimage
 
 from refield.estimate import recipe
 from refield.estimate.alone import object_alone
-from refield.estimate.associate import looks_gone, take_off
+from refield.estimate.associate import take_off
+from refield.estimate.settle import looks_gone
 from refield.estimate.conclude import _shown_in
 from refield.estimate.detail import detail_of
 from refield.estimate.explain import explained_before
