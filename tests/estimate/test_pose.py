@@ -12,7 +12,6 @@ from scipy import ndimage
 from refield.estimate import recipe
 from refield.estimate.alone import object_alone
 from refield.estimate.associate import take_off
-from refield.estimate.settle import looks_gone
 from refield.estimate.conclude import _shown_in
 from refield.estimate.detail import detail_of
 from refield.estimate.explain import explained_before
@@ -28,6 +27,7 @@ from refield.estimate.outline import ObjectConfig, remembered
 from refield.estimate.past import changed_share, gone_score, look_past
 from refield.estimate.pose_change import RefineConfig, refine, residuals
 from refield.estimate.register import Target, register, super_fibonacci, turns_about
+from refield.estimate.settle import looks_gone
 from refield.field.render import render_camera
 from refield.field.source import Known
 from refield.scene.camera import Camera

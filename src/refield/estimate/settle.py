@@ -51,12 +51,18 @@ class _Wholes:
     ground: Ground
     known: dict[int, Old | None] = field(default_factory=dict)
 
-    def of(self, piece: Old) -> Old | None:
-        """The whole thing, where it stands free."""
-        if id(piece) not in self.known:
-            g = self.ground
-            self.known[id(piece)] = standing(g.field, g.photographed, piece, g.planes, g.shape)
-        return self.known[id(piece)]
+    def of(self, pieces: Sequence[Old]) -> list[Old]:
+        """The whole things, where they stand free, each once."""
+        out: list[Old] = []
+        for piece in pieces:
+            if any(_within(piece, whole) for whole in out):
+                continue
+            if id(piece) not in self.known:
+                g = self.ground
+                self.known[id(piece)] = standing(g.field, g.photographed, piece, g.planes, g.shape)
+            whole = self.known[id(piece)]
+            out += [whole] if whole is not None else []
+        return out
 
 
 def _exchanges(ground: Ground, changed: Sequence[Changed], best: Settled, wholes: _Wholes) -> Iterator[Settled]:
@@ -70,19 +76,18 @@ def _exchanges(ground: Ground, changed: Sequence[Changed], best: Settled, wholes
         yield _completed(ground, olds, best.touched, changed, others)
     if not best.arrived and (best.moved or best.removed):
         return
-    for k, old in olds.items():
-        if k in best.removed:
-            continue
-        for one in (old, old.instead, wholes.of(old)):
-            if one is None:
-                continue
-            apart = [j for j in best.touched if j != k and not _within(olds[j], one)]
-            others = {j: c for j, c in best.moved.items() if j in apart}
-            gone = [one, *(olds[j] for j in apart if j in best.moved or j in best.removed)]
-            views = without(ground, changed, gone, [(olds[j], c) for j, c in others.items()])
-            fit = slid(ground, one, gone, views)
-            if fit is not None:
-                yield _completed(ground, olds | {k: fit.old}, [k, *apart], changed, others | {k: fit.change})
+    pieces = {k: old for k, old in olds.items() if k not in best.removed}
+    asked = [(k, one) for k, old in pieces.items() for one in (old, old.instead) if one is not None]
+    for whole in wholes.of(list(pieces.values())):
+        asked.append((next(k for k, old in pieces.items() if _within(old, whole)), whole))
+    for k, one in asked:
+        apart = [j for j in best.touched if j != k and not _within(olds[j], one)]
+        others = {j: c for j, c in best.moved.items() if j in apart}
+        gone = [one, *(olds[j] for j in apart if j in best.moved or j in best.removed)]
+        views = without(ground, changed, gone, [(olds[j], c) for j, c in others.items()])
+        fit = slid(ground, one, gone, views)
+        if fit is not None:
+            yield _completed(ground, olds | {k: fit.old}, [k, *apart], changed, others | {k: fit.change})
 
 
 def _within(piece: Old, whole: Old) -> bool:
