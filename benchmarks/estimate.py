@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
+from typing import cast
 
 import torch
 from change_score import Found, Score, score
@@ -33,6 +34,7 @@ from refield.scene.errors import InputError
 from refield.scene.load import load_capture, load_new_photos
 from refield.synthetic.cameras import ring, square_camera
 from refield.synthetic.disturb import Disturbance, disturbed
+from refield.synthetic.grounds import Ground, on_ground
 from refield.synthetic.worlds import WORLDS, World
 from refield.synthetic.write import shoot_state, true_change, write_world
 from refield.workspace import Workspace
@@ -71,6 +73,12 @@ class Scene:
         return load_new_photos(out, self.capture)
 
 
+def ground_of(name: str) -> tuple[str, Ground]:
+    """The world and the ground of ``cube-wavy``."""
+    world, _, ground = name.partition("-")
+    return world, cast(Ground, ground or "flat")
+
+
 class Bench:
     """Makes scenes once, and keeps what was found."""
 
@@ -81,17 +89,21 @@ class Bench:
         """of the section ``kinds``"""
 
     def scene(self, name: str, seed: int = 0, size: int | None = None) -> Scene:
-        """Photographed and fitted by the defaults, unless that was done before."""
+        """Photographed and fitted by the defaults, unless that was done before. ``cube-wavy`` is the cube on wavy
+        ground."""
         size = size or self.size
         folder = self.work / f"{name}_{seed}_{size}"
+        world, ground = ground_of(name)
         if not (folder / "data" / "truth").exists():
-            write_world(name, folder / "data", size=size, spp=self.spp, cameras=self.cameras, seed=seed)
+            paths, cameras = self.spp, self.cameras
+            write_world(world, folder / "data", size=size, spp=paths, cameras=cameras, ground=ground, seed=seed)
         if not (folder / "work").exists():
             capture = load_capture(folder / "data" / "before")
             with Workspace.building(folder / "work") as workspace:
                 workspace.keep_field(fit_field(workspace.keep_capture(capture), FitConfig()))
         workspace = Workspace.open(folder / "work")
-        return Scene(folder, WORLDS[name](seed), workspace.capture(), workspace.field())
+        known = on_ground(WORLDS[world](seed), ground, seed)
+        return Scene(folder, known, workspace.capture(), workspace.field())
 
     def report(self, section: str, note: str, rows: list[Row]) -> None:
         """Print a table and keep it."""

@@ -77,7 +77,7 @@ def noting_captures(device: torch.device) -> Iterator[Captures]:
 def fit(model: HashField, capture: Capture, config: FitConfig, device: torch.device, looks: list[FitProgress]) -> None:
     """`fit_on_gpu`; on a CPU the same loop by the same kernels."""
     if device.type == "cuda":
-        gpu_fit.fit_on_gpu(model, Photos.of(capture), config, looks.append)
+        gpu_fit.fit_on_gpu(model, capture, Photos.of(capture), config, looks.append)
     else:
         usual = gpu_fit._SIZES, gpu_fit.EVERY
         gpu_fit._SIZES, gpu_fit.EVERY = [8], 4

@@ -21,7 +21,7 @@ import torch
 from gauntlet.match import true_objects
 from numpy.typing import NDArray
 
-from refield.estimate import associate, recipe
+from refield.estimate import recipe
 from refield.estimate.detect import Changed
 from refield.estimate.objects import Old
 from refield.estimate.outline import ObjectConfig
@@ -49,7 +49,7 @@ def outlined(work: Path, photos: Path) -> tuple[Sequence[Old], Sequence[Changed]
         kept.append((olds, changed))
         raise _Outlined
 
-    with patch.object(associate, "settle", stop):
+    with patch.object(recipe, "settle", stop):
         try:
             recipe.estimate_change(capture, before, load_new_photos(photos, capture))
         except _Outlined:

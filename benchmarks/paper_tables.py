@@ -213,7 +213,8 @@ _ABOUT_3 = (
     "grown for shadows) and the new photos whole, all pixels drawn alike. Fine-tuned: the old field's weights trained "
     "on with the same data and settings. Both are given the usual number of steps and stop as every fit does. "
     "In-painted: OpenCV's method in the out-mask, of the old field's render, and of the evaluation photo as the "
-    "paper does with LaMa, whose figures stand beside it. Totals hold the estimate, whose masks the baselines need too."
+    "paper does with LaMa, whose figures stand beside it. Totals hold the estimate, whose masks the baselines need "
+    "too. Re-training [does better with other settings](#re-training-at-its-best-2026-11-24)."
 )
 _ABOUT_ALIGNED = "By the homography that correlates them best (§5.3)."
 _ABOUT_DERIVED = (

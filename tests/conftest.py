@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from refield.cli import main
-from refield.field.sampling import RESOLUTION
 from tests.browser import CHROMIUM
 from tests.captures import write_capture
 from tests.photos.reconstructed import reconstructed as reconstructed
@@ -18,23 +17,6 @@ TINY_FIT += ["--fit.field.log2-table", "8", "--fit.field.width", "8"]
 
 HERE = {**os.environ, "PYTHONPATH": os.pathsep.join(str(Path(p).resolve()) for p in sys.path)}
 """The environment of a process that imports what this one imports."""
-
-
-@pytest.fixture(scope="session", autouse=True)
-def coarse_cells():
-    """Fits of a moment look into 64³ cells in place of 128³: making these and looking them through is most of what they
-    take. What is begun as a process of its own, and `tests/chain`, has the usual cells."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("refield.field.placing.RESOLUTION", 64)
-        yield
-
-
-@pytest.fixture(scope="module")
-def usual_cells():
-    """For a file whose tests heed what the cells hold, or tenths of a dB: it names this before all its fixtures."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("refield.field.placing.RESOLUTION", RESOLUTION)
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -23,6 +23,7 @@ from tests.captures import write_capture
 
 __all__ = ["capture", "change", "old"]  # fixtures
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+SCRIPTS = ("tables", "estimate", "record", "change_score", "paper_tables", "departures", "retraining", "grounds")
 MEASURES = ("psnr", "ssim", "psnr_in", "ssim_in", "lpips_in", "psnr_out", "ssim_out", "lpips_out", "psnr_untouched")
 
 
@@ -33,7 +34,7 @@ def tables(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Any]]:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     yield importlib.import_module
     for name in set(sys.modules) - before:
-        if name.split(".")[0] in ("tables", "estimate", "record", "change_score", "paper_tables", "departures"):
+        if name.split(".")[0] in SCRIPTS:
             del sys.modules[name]
 
 

@@ -13,13 +13,14 @@ from refield.baselines.curve import Curve, Point, looks_until, settled, time_to
 from refield.baselines.finetune import finetune
 from refield.baselines.material import material
 from refield.baselines.retrain import retrain
+from refield.baselines.told import carried_along, left_empty
 from refield.field.fit import FitConfig, fit_field
 from refield.field.radiance import Field, HashField, HashFieldConfig
 from refield.field.render import render_camera, render_frame
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame
 from refield.scene.change import PlacedPhoto, SceneChange
-from refield.scene.images import write_image
+from refield.scene.images import frame_image, write_image
 from refield.update.supervision import places_of
 from tests.update.worlds import Ball, BallWorld, at, looking_from, moved
 
@@ -31,7 +32,6 @@ TINY = FitConfig(
     field=HashFieldConfig(levels=6, finest=64, log2_table=12),
     finest_auto=False,
 )
-pytestmark = pytest.mark.usefixtures("usual_cells")
 OLD, NEW = at(-0.3, 0.2, 0.25), at(0.4, -0.3, 0.25)
 BEFORE, AFTER = BallWorld((Ball(OLD, 0.25),)), BallWorld((Ball(NEW, 0.25),))
 
@@ -89,6 +89,36 @@ def test_an_unsure_mask_leaves_its_photo_out(capture: Capture, change: SceneChan
 
 def test_nothing_changed_masks_nothing(capture: Capture) -> None:
     assert not material(capture, SceneChange()).valid
+
+
+def test_old_photos_carried_along_show_what_moved_where_it_is_now(capture: Capture, change: SceneChange) -> None:
+    since = carried_along(capture, material(capture, change), change)
+    assert len(since.carried) == len(capture.train) and since.frames == change.frames
+    assert not {f.name for f in since.carried} & {f.name for f in capture.frames + change.frames}
+    for frame in since.carried[::5]:
+        mask = since.valid[frame.name]
+        now, then = (render_camera(w, CAMERA, frame.world_from_cam).rgb for w in (AFTER, BEFORE))
+        assert mask.sum() > 10
+        assert (frame_image(frame) / 255 - now)[mask].abs().mean() < 0.02 < 0.05 < (now - then)[mask].abs().mean()
+
+
+def test_what_does_not_move_is_not_carried_along(capture: Capture, change: SceneChange) -> None:
+    (ball,) = change.objects
+    gone = replace(change, objects=(replace(ball, kind="removed", new_from_old=None),))
+    assert not carried_along(capture, material(capture, gone), gone).carried
+    unsure = replace(change, objects=(replace(ball, masks=(None,) * len(capture.train)),))
+    assert not carried_along(capture, material(capture, unsure), unsure).carried
+
+
+def test_what_left_is_empty_but_for_its_rim_and_what_is_there_now(change: SceneChange) -> None:
+    (empty,) = left_empty(change)
+    middle, (x, y, z) = OLD[:3, 3].float(), (0.25, 0.0, 0.0)
+    rim = middle + torch.tensor([x - 0.02, y, z])
+    assert empty.contains(torch.stack([middle, rim, NEW[:3, 3].float()])).tolist() == [True, False, False]
+    (ball,) = change.objects
+    (near,) = left_empty(replace(change, objects=(replace(ball, new_from_old=at(0.3, 0, 0)),)))
+    assert 0 < near.occupied().shape[0] < empty.occupied().shape[0]
+    assert not left_empty(replace(change, objects=(replace(ball, kind="added", new_from_old=None),)))
 
 
 @pytest.mark.parametrize("tuned", [False, True])

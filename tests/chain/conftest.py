@@ -11,22 +11,12 @@ from typing import Any
 
 import pytest
 
-from refield.field.sampling import RESOLUTION
-
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("REFIELD_TEST_DATA", ROOT.parent / "shared" / "data"))
 SMALL = ("--size", "96", "--spp", "32")
 NAMED, RANDOM = (*SMALL, "--cameras", "40"), (*SMALL, "--photos", "40")
 
 Row = dict[str, Any]
-
-
-@pytest.fixture(scope="session", autouse=True)
-def coarse_cells():
-    """None here, be it that the other tests are run along with these."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("refield.field.placing.RESOLUTION", RESOLUTION)
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from refield.estimate import recipe
 from refield.estimate.alone import object_alone
-from refield.estimate.associate import looks_gone, take_off
+from refield.estimate.associate import take_off
 from refield.estimate.conclude import _shown_in
 from refield.estimate.detail import detail_of
 from refield.estimate.explain import explained_before
@@ -27,6 +27,7 @@ from refield.estimate.outline import ObjectConfig, remembered
 from refield.estimate.past import changed_share, gone_score, look_past
 from refield.estimate.pose_change import RefineConfig, refine, residuals
 from refield.estimate.register import Target, register, super_fibonacci, turns_about
+from refield.estimate.settle import looks_gone
 from refield.field.render import render_camera
 from refield.field.source import Known
 from refield.scene.camera import Camera

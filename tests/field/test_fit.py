@@ -18,12 +18,14 @@ from refield.field.fit import FitConfig, FitProgress, _Fit, fit_field
 from refield.field.memory import memory_of
 from refield.field.photos import HeldOut, Photos, Since
 from refield.field.pixels import PixelBank
-from refield.field.placing import place_contraction
+from refield.field.placing import opened, place_contraction
 from refield.field.radiance import HashField, HashFieldConfig
-from refield.field.render import render_frame
+from refield.field.render import render_frame, render_many, render_rays
+from refield.field.sampling import IN_PICTURES
 from refield.field.schedule import at_plateau, rate_factor
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
+from refield.scene.change import OccupancyGrid
 from refield.scene.errors import InputError
 from refield.scene.images import frame_image
 from refield.scene.pose import rigid
@@ -70,6 +72,30 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 def fitted(capture: Capture) -> tuple[HashField, list[FitProgress]]:
     looks: list[FitProgress] = []
     return fit_field(capture, TINY, looks.append), looks
+
+
+def test_pictures_have_shorter_samples_than_a_fit(fitted: tuple[HashField, list[FitProgress]]) -> None:
+    field, _ = fitted
+    assert field.sampler.per_step == IN_PICTURES > 1
+    assert field.sampler.lattice[2] == field.sampler.step / IN_PICTURES
+    tensors, facts = field.state()
+    assert HashField.from_state(tensors, facts).sampler.per_step == IN_PICTURES
+    facts["sampler"].pop("per_step")  # as written by older versions
+    assert HashField.from_state(tensors, facts).sampler.lattice[2] == field.sampler.step
+    assert opened(field).sampler.per_step == 1  # a fit that goes on
+
+
+def test_shorter_samples_are_nearer_to_the_mean_over_where_samples_lie(
+    capture: Capture, fitted: tuple[HashField, list[FitProgress]]
+) -> None:
+    field = HashField.from_state(*fitted[0].state())
+    rays = camera_rays(CAMERA, capture.held_out[0].world_from_cam)
+    short = render_many(field, rays).rgb
+    field.sampler = replace(field.sampler, per_step=1.0)
+    torch.manual_seed(4)
+    with torch.no_grad():
+        mean = torch.stack([render_rays(field, rays, jitter=True).rgb for _ in range(16)]).mean(0)
+    assert (short - mean).square().mean() < 0.8 * (render_many(field, rays).rgb - mean).square().mean()
 
 
 def test_held_out_views_are_explained(capture: Capture, fitted: tuple[HashField, list[FitProgress]]) -> None:
@@ -301,6 +327,49 @@ def test_pixels_out_of_date_do_not_teach_and_newer_photos_do(capture: Capture) -
     assert (bank.places[chosen] % 32 < 16)[owner < len(capture.train)].all()
     judge = photos.judge()
     assert judge.rays is not None and len(judge.rays) == 512 * len(capture.held_out)
+
+
+def test_newer_photos_have_the_share_of_the_rays_that_they_are_to_have(capture: Capture) -> None:
+    torch.manual_seed(0)
+    since = Since(capture.train[-2:], share=0.25)
+    photos = Photos.of(capture, since)
+    bank, newer = photos.bank(), len(capture.train)
+    drawn = bank.frame_of(photos.drawn(bank, 4000))
+    assert int((drawn >= newer).sum()) == 1000 and drawn.unique().tolist() == [*range(newer + 2)]
+    alike = replace(photos, since=replace(since, share=None))
+    assert 50 < int((bank.frame_of(alike.drawn(bank, 4000)) >= newer).sum()) < 250  # 2 photos of 56
+    none = {f.name: torch.zeros(32, 32, dtype=torch.bool) for f in capture.frames}
+    alone = Photos.of(capture, replace(since, valid=none))
+    assert len(alone.drawn(alone.bank(), 100)) == 100  # nothing old is left to draw
+
+
+def test_photos_that_are_carried_along_teach_where_they_show_the_scene(capture: Capture) -> None:
+    first = replace(capture.train[0], name="carried")
+    half = torch.arange(32)[None].expand(32, 32) < 16
+    photos = Photos.of(capture, Since(capture.train[-1:], {"carried": half}, carried=(first,), share=0.5))
+    bank, carried = photos.bank(), len(capture.train)
+    assert int(bank.starts[carried + 1] - bank.starts[carried]) == 512
+    drawn = bank.frame_of(photos.drawn(bank, 1000))
+    assert int((drawn == carried + 1).sum()) == 500 and (drawn == carried).any()
+
+
+def test_what_is_known_to_be_empty_stays_empty(capture: Capture) -> None:
+    """The ball is where nothing may be: the fit shows the photos worse, and shows them by something else."""
+    box = torch.tensor([[-0.5] * 3, [0.5] * 3])
+    ball = OccupancyGrid(box, torch.ones(4, 4, 4))
+    field = fit_field(capture, replace(TINY, steps=100), since=Since(empty=(ball,)))
+    inside = field.sampler.cells_in(box)
+    inside = inside[ball.contains(field.sampler.points_in(inside, jitter=False))]
+    assert len(inside) > 100 and not field.sampler.grid.reshape(-1)[inside].any()
+    assert field.sampler.grid.any()
+
+
+def test_colours_without_directions_are_the_same_from_everywhere(capture: Capture) -> None:
+    x, d = torch.rand(50, 3) - 0.5, torch.nn.functional.normalize(torch.randn(2, 50, 3), dim=-1)
+    for directions in (True, False):
+        field = fit_field(capture, replace(TINY, steps=60, directions=directions))
+        one, other = (field(x, way)[1] for way in d)
+        assert torch.equal(one, other) != directions
 
 
 def test_masks_and_a_budget_together(capture: Capture) -> None:

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import sys
 from copy import deepcopy
+from functools import partialmethod
 from pathlib import Path
 
 import pytest
@@ -13,13 +14,20 @@ import torch
 from torch import Tensor
 
 from refield.field.encoding import geometric_levels
+from refield.field.fit import FitConfig
 from refield.field.kernels import reference
-from refield.field.kernels.reference import Aim, Batch
+from refield.field.kernels.reference import Aim, Batch, Stepped
+from refield.field.occupancy import OccupancyTrainer
+from refield.field.photo_model import PhotoModel, PhotoModelConfig
+from refield.field.photos import HeldOut, Photos
 from refield.field.pixels import PixelBank
-from refield.field.radiance import HashField
+from refield.field.placing import new_field
+from refield.field.radiance import HashField, HashFieldConfig
+from refield.field.sampling import IN_PICTURES
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame
 from tests.captures import CAMERA, DISTORTED, ring
+from tests.field.scenes import room
 from tests.fields import small_field
 
 ON_GPU = torch.cuda.is_available()
@@ -29,6 +37,7 @@ with pytest.MonkeyPatch.context() as patch:
     if not ON_GPU:
         patch.setenv("TRITON_INTERPRET", "1")  # read where kernels are defined, and again where they run
     pytest.importorskip("triton")
+    from refield.field import gpu_fit
     from refield.field.gpu_fit import move
     from refield.field.graphed import Descent, DevicePixels, GraphedStep
     from refield.field.kernels import gpu
@@ -356,6 +365,7 @@ def test_train_step() -> None:
     assert_equal([(a, b.cpu()) for a, b in zip(expected, into)], rtol=2e-2 if ON_GPU else 1e-3, share=1e-2)
     seen = zip((truth.shown, truth.errors, *truth.to_rays), (fast.shown, fast.errors, *fast.to_rays))
     assert_equal([(a, b.cpu()) for a, b in seen], rtol=2e-2 if ON_GPU else 1e-3, share=1e-2)
+    assert torch.equal(fast.heaviest.cpu(), truth.heaviest) and (truth.heaviest >= 0).any()
     n, spare = len(fast.cells), 30
     again = zeros_for(moved(parts[4]))
     roomy = gpu.train_step(batch, *moved(parts[1:5]), parts[5], again, capacity=n + spare)
@@ -363,8 +373,11 @@ def test_train_step() -> None:
     assert_equal([(a.cpu(), b.cpu()) for a, b in zip(into, again)])
     assert (roomy.weights[n:] == -1).all() and (roomy.sigmas[n:] == -1).all()
     torch.testing.assert_close((roomy.weights[:n], roomy.cells[:n]), (fast.weights, fast.cells))
+    assert torch.equal(roomy.heaviest, fast.heaviest)
     tight = gpu.train_step(batch, *moved(parts[1:5]), parts[5], again, capacity=n // 2)
     assert torch.isfinite(tight.loss) and (tight.weights >= 0).all()
+    left_out = tight.heaviest != fast.heaviest
+    assert left_out.any() and (tight.heaviest[left_out] == -1).all()
 
 
 def bank() -> PixelBank:
@@ -383,6 +396,10 @@ def test_device_pixels_are_the_banks() -> None:
     rays = fast.rays(chosen.to(DEVICE))
     torch.testing.assert_close((rays.origins.cpu(), rays.directions.cpu()), (truth.origins, truth.directions))
     assert torch.equal(fast.colours(chosen.to(DEVICE)).cpu(), pixels.colours(chosen))
+    assert torch.equal(fast.place_of(chosen.to(DEVICE)).cpu(), pixels.place_of(chosen))
+    owner = pixels.frame_of(chosen)
+    basis = fast.vignetting_basis(chosen.to(DEVICE), owner.to(DEVICE))
+    torch.testing.assert_close(basis.cpu(), pixels.vignetting_basis(chosen, owner))
 
 
 def occupancy_state(model: HashField) -> Tensor:
@@ -392,17 +409,21 @@ def occupancy_state(model: HashField) -> Tensor:
     return state
 
 
-def graphed_step(model: HashField, rays: int = 24, capacity: int = 400) -> GraphedStep:
+def graphed_step(
+    model: HashField, rays: int = 24, capacity: int = 400, asked: PhotoModelConfig | None = None
+) -> GraphedStep:
     sampler = model.sampler
     space = (sampler.contraction.centre, sampler.contraction.radius)
     where = (space, sampler.grid, (0.0, 8.0, 0.3), model.encoding.resolutions)
     occupancy, aim = (occupancy_state(model).to(DEVICE), 0.8), Aim(1e-2, 1.0, 7.0)
-    return GraphedStep(Descent(model), DevicePixels(bank(), DEVICE), where, aim, occupancy, (rays, capacity))
+    with torch.device(DEVICE):
+        photos = PhotoModel(DevicePixels(bank(), DEVICE), sampler, asked or PhotoModelConfig())
+    return GraphedStep(Descent(model), photos, where, aim, occupancy, (rays, capacity))
 
 
 def drawn(step: GraphedStep) -> Batch:
     """What the step is about to draw."""
-    chosen = torch.randint(len(step.pixels), (step.rays,), device=DEVICE).cpu()
+    chosen = torch.randint(len(step.photos.bank), (step.rays,), device=DEVICE).cpu()
     jitter, background = torch.rand(step.rays, device=DEVICE).cpu(), torch.rand(step.rays, 3, device=DEVICE).cpu()
     rays = bank().rays(chosen)
     return Batch((rays.origins, rays.directions, jitter), bank().colours(chosen), background)
@@ -437,6 +458,87 @@ def test_graphed_step_is_the_fits() -> None:
     torch.testing.assert_close(step.occupancy[0].cpu(), state, rtol=1e-2, atol=1e-4)
 
 
+def test_photos_learn_from_graphed_steps_as_from_the_fits() -> None:
+    """Exposures, poses and trust, against what the reference's step tells the same model on the CPU."""
+    asked = PhotoModelConfig(exposures=True, poses=True, trust=True)
+    model = small_field(2).train().requires_grad_()
+    plain = deepcopy(model).requires_grad_(False)
+    truth = PhotoModel(bank(), plain.sampler, asked)
+    move(model, DEVICE)
+    step = graphed_step(model, asked=asked)
+    space = (plain.sampler.contraction.centre, plain.sampler.contraction.radius)
+    field = (plain.encoding.tables, plain.encoding.resolutions, plain.networks)
+    step.progress = 0.9
+    for photos in (truth, step.photos):
+        photos.exposing = True
+        photos.exposures.log_gains[0], photos.exposures.vignetting[0, 0] = 0.2, -0.1
+        photos.exposures._steps = 30  # so that they are followed after two
+        photos.trust.trust[::3] = 0.4
+    for count in (1, 2):
+        torch.manual_seed(count)
+        chosen = torch.randint(len(truth.bank), (step.rays,), device=DEVICE).cpu()
+        ask = truth.ask(chosen, 0.9)
+        into = [torch.zeros_like(w) for w in (field[0], *field[2])]
+        found = reference.train_step(ask.batch, space, plain.sampler.grid, (0.0, 8.0, 0.3), field, step.aim, into)
+        truth.learn(ask, found, 0.9, 0.5)
+        torch.manual_seed(count)
+        step.run_eager()  # the descent's rate is 0
+        step.photos.learn(step.asked, step.found, 0.9, 0.5)
+    fast = step.photos
+    assert truth.poses.moved.abs().max() > 1e-4
+    assert (truth.exposures.log_gains[1:].abs().amax(1) > 1e-5).all()
+    pairs = [(truth.poses.moved, fast.poses.moved), (truth.poses.lens, fast.poses.lens)]
+    pairs += [(truth.exposures.log_gains, fast.exposures.log_gains)]
+    pairs += [(truth.exposures.vignetting, fast.exposures.vignetting)]
+    pairs += [(getattr(truth.trust, known), getattr(fast.trust, known)) for known in ("_patches", "_places")]
+    assert_equal([(a, b.cpu()) for a, b in pairs], rtol=2e-2, share=2e-2)
+
+
+def roomy(*parts: object, capacity: int) -> Stepped:
+    """The reference's step, as a step with a capacity tells it: the interpreter takes seconds for each."""
+    found = reference.train_step(*parts)
+    spare = capacity - len(found.cells)
+    w, sigmas = (torch.cat([t, t.new_full((spare,), -1.0)]) for t in (found.weights, found.sigmas))
+    cells = torch.cat([found.cells, found.cells.new_zeros(spare)])
+    return found._replace(loss=torch.tensor(found.loss), cells=cells, weights=w, sigmas=sigmas)
+
+
+@pytest.mark.skipif(ON_GPU, reason="steps are the reference's, on the CPU")
+def test_the_loop_finds_out_about_photos_as_the_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stages: list[tuple[bool, ...]] = []
+
+    def eager(step: GraphedStep) -> int:
+        stages.append(step.photos.stage(step.progress))
+        assert step.plain == stages[-1][1]
+        step.run_eager()
+        return 1
+
+    monkeypatch.setattr(gpu_fit, "_SIZES", [16])
+    monkeypatch.setattr(gpu_fit, "EVERY", 3)
+    monkeypatch.setattr(GraphedStep, "capture", eager)
+    monkeypatch.setattr(GraphedStep, "replay", GraphedStep.run_eager)
+    monkeypatch.setattr(gpu, "train_step", roomy)
+    monkeypatch.setattr(HeldOut, "tells_exposures", lambda self, model: True)
+    monkeypatch.setattr(OccupancyTrainer, "settle", partialmethod(OccupancyTrainer.settle, rays=500))
+    capture = room(tmp_path)
+    shape = HashFieldConfig(levels=2, coarsest=8, finest=16, log2_table=10, width=16)
+    asked = PhotoModelConfig(exposures=True, poses=True, trust=True)
+    config = FitConfig(steps=60, samples=32, check_every=10**6, field=shape, finest_auto=False, photos=asked)
+    torch.manual_seed(0)
+    model = new_field(capture, config, 0).train()
+    everywhere = torch.ones(model.sampler.resolution**3, dtype=torch.bool)
+    fit = gpu_fit._GpuFit(model, Photos.of(capture), config, ((everywhere, ~everywhere), True), (None, None))
+    fit.run()
+    # exposed, plain, trust, poses
+    expected = [(False, True, False, False), (False, True, True, False), (True, True, True, False)]
+    assert list(dict.fromkeys(stages)) == [*expected, (True, False, True, True)]
+    told = fit.photos.told(capture, fit.judge, model)
+    gains = torch.tensor([f.exposure.gains for f in told.frames if f.exposure is not None])
+    assert len(gains) == len(capture.frames) and (gains != 1).any(1).all()
+    moved = [bool((a.world_from_cam != b.world_from_cam).any()) for a, b in zip(told.train, capture.train)]
+    assert any(moved) and model.sampler.per_step == IN_PICTURES
+
+
 def start_of(seed: int) -> list[Tensor]:
     model = small_field(seed)
     return [model.encoding.tables, *model.networks]
@@ -449,11 +551,13 @@ def test_a_step_without_a_finite_loss_changes_nothing() -> None:
     step.descent.rate.fill_(1e-2)
     step.run_eager()
     before = [w.detach().clone() for w in (model.encoding.tables, *model.networks, step.occupancy[0])]
-    step.pixels._rgb = step.pixels._rgb.float() * torch.nan
+    pixels = step.photos.bank
+    pixels._rgb = pixels._rgb.float() * torch.nan
     step.now.fill_(2)
     step.run_eager()
     step.run_eager()
     assert (int(step.descent.bad), int(step.descent.count)) == (2, 1)
+    assert not step.found.errors.any() and (step.found.heaviest == -1).all()  # photos learn nothing from it
     for old, new in zip(before, (model.encoding.tables, *model.networks, step.occupancy[0])):
         assert torch.equal(old, new)
     with pytest.raises(RuntimeError, match="capture"):

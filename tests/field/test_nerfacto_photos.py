@@ -14,6 +14,7 @@ from refield.field.fit_nerfacto import NerfactoFitConfig, _NerfactoFit, fit_nerf
 from refield.field.kernels.reference import Batch
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
 from refield.field.photo_model import PhotoModelConfig
+from refield.field.photos import Photos
 from refield.field.placing import DIRECTED, place_contraction
 from refield.field.proposal import even_edges
 from refield.scene.capture import Capture, Rays
@@ -53,7 +54,7 @@ def run_of(capture: Capture, config: NerfactoFitConfig) -> _NerfactoFit:
     """A fit that has not begun."""
     torch.manual_seed(0)
     field = NerfactoField(SHAPE, looking_everywhere(place_contraction(capture), SHAPE))
-    return _NerfactoFit(field, capture, config, None)
+    return _NerfactoFit(field, Photos.of(capture), config, None)
 
 
 def test_exposures_are_found(plain: Capture, tmp_path: Path) -> None:

@@ -28,8 +28,6 @@ SHAPE = HashFieldConfig(levels=4, coarsest=8, finest=48, log2_table=14, width=16
 TINY = FitConfig(steps=400, samples=4096, distortion=2e-3, check_every=10**6, field=SHAPE, finest_auto=False)
 VIGNETTING = (-0.2, -0.1, 0.0)
 
-pytestmark = pytest.mark.usefixtures("usual_cells")
-
 
 def fitted(capture: Capture, steps: int = TINY.steps, **asked: bool) -> tuple[Fitted, float]:
     """What a fit found, and its PSNR on held-out photos, dB."""

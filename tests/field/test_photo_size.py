@@ -87,11 +87,15 @@ def test_a_pixel_of_which_a_part_is_out_of_date_does_not_teach(capture: Capture)
     first, second = capture.train[:2]
     valid: dict[str, Tensor] = {first.name: torch.ones(16, 24, dtype=torch.bool)}
     valid[first.name][3, 5] = False
-    small, since = as_read(capture, Since((second,), valid), HALF)
+    carried = replace(first, name="carried")
+    valid["carried"] = valid[first.name]
+    small, since = as_read(capture, Since((second,), valid, (carried,), share=0.5), HALF)
     mask = since.valid[first.name]
     assert mask.shape == (8, 12) and not mask[1, 2] and int(mask.sum()) == 8 * 12 - 1
     assert since.frames[0].camera.width == second.camera.width // 2
-    assert len(Photos.of(small, since).bank()) == 96 * (len(capture.train) + 1) - 1
+    assert since.carried[0].camera == small.frames[0].camera and since.share == 0.5
+    assert torch.equal(since.valid["carried"], mask)
+    assert len(Photos.of(small, since).bank()) == 96 * (len(capture.train) + 2) - 2
 
 
 def test_a_fit_of_small_photos_hands_the_capture_back_at_full_size(capture: Capture):

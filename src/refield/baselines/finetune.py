@@ -5,6 +5,7 @@ from __future__ import annotations
 from refield.baselines.curve import Curve
 from refield.baselines.retrain import DEFAULTS, trained
 from refield.field.fit import FitConfig
+from refield.field.photos import Since
 from refield.field.radiance import HashField
 from refield.scene.capture import Capture
 from refield.scene.change import SceneChange
@@ -16,6 +17,7 @@ def finetune(
     change: SceneChange,
     config: FitConfig = DEFAULTS,
     curve: Curve | None = None,
+    since: Since | None = None,
 ) -> HashField:
     """The old field trained on with the data and the settings of `retrain.retrain`; ``field`` itself is not changed.
 
@@ -25,4 +27,4 @@ def finetune(
         ValueError: the change leaves no pixel to train on.
         NonFiniteError: as of `fit_field`.
     """
-    return trained(capture, change, config, curve, field)
+    return trained(capture, change, config, curve, field, since)

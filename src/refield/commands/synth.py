@@ -87,6 +87,8 @@ def _into(options: Synth, work: Path, clock: Clock) -> Answer:
 def _refuse_the_others_options(options: Synth) -> None:
     if options.world == RANDOM and options.config.cameras is not None:
         raise InputError("--cameras", "is for the worlds that have a name", "give --photos for the world random")
+    if options.world == RANDOM and options.config.ground != "flat":
+        raise InputError("--ground", "is for the worlds that have a name", "leave it out for the world random")
     for name, instead in _OF_RANDOM.items():
         if options.world != RANDOM and getattr(options.config, name):
             raise InputError(f"--{name}", f"is for the world {RANDOM}", instead.format(options.world))

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from refield.estimate import past, segment
 from refield.estimate.arrive import fresh, shadow_of
-from refield.estimate.associate import Settled
 from refield.estimate.detect import Changed, Errors, Mask
 from refield.estimate.hull import Hull
 from refield.estimate.lattice import Lattice, Voxels
 from refield.estimate.layers import Sight, layers_at
+from refield.estimate.likelihood import Settled
 from refield.estimate.look import Array, full_size
 from refield.estimate.objects import Old
 from refield.estimate.pose_change import PoseChange

@@ -14,7 +14,7 @@ from refield.estimate.look import Array
 from refield.scene.srgb import to_linear, to_srgb
 from refield.vision import pixels
 
-_LIMIT = 1.5  # times the difference from which on a pixel counts as changed
+LIMIT = 1.5  # times the difference from which on a pixel counts as changed
 _FEWEST = 50  # pixels from which a share is told
 
 
@@ -50,8 +50,8 @@ def explained(photos: Sequence[Compared], sigma: float) -> Explained:
     with_it, without, count = 0, 0, 0
     for p in photos:
         here = p.sides >= 0
-        limit = _LIMIT * p.threshold
-        new = pixels.colour_difference(p.photo, _relit(p, sigma), 1)
+        limit = LIMIT * p.threshold
+        new = pixels.colour_difference(p.photo, relit(p, sigma), 1)
         old = pixels.colour_difference(p.photo, p.unchanged, 1)
         with_it += int((here & (new < limit)).sum())
         without += int((here & (old < limit)).sum())
@@ -71,12 +71,12 @@ def explained_before(pictures: Sequence[tuple[Array, Array, NDArray[np.bool_]]],
     right, count = 0, 0
     for photo, rendering, here in pictures:
         if here.any():
-            right += int((here & (pixels.colour_difference(photo, rendering, 1) < _LIMIT * threshold)).sum())
+            right += int((here & (pixels.colour_difference(photo, rendering, 1) < LIMIT * threshold)).sum())
             count += int(here.sum())
     return right / count if count >= _FEWEST else 1.0
 
 
-def _relit(p: Compared, sigma: float) -> Array:
+def relit(p: Compared, sigma: float) -> Array:
     """The composite with each side's smooth light taken from the photo: what turned is lit anew."""
     seen, shown = to_linear(p.photo), to_linear(np.maximum(p.composite, 0))
     ratio = np.zeros_like(shown)

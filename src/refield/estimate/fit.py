@@ -97,8 +97,8 @@ def _part_of(
         return None
     best, other = max(found, key=lambda f: f[0].change.net)
     pose = [best.change.new_from_old]
-    if _refined(ground, other, olds, past, pose, best.score) is not None:
-        whole = _refined(ground, old, olds, past, pose, best.score)
+    if _refined(ground, other, olds, past, pose, best.score, ground.believe.gains) is not None:
+        whole = _refined(ground, old, olds, past, pose, best.score, ground.believe.gains)
         if whole is not None:
             return whole
     return replace(best, rest=other)
@@ -127,18 +127,48 @@ def best_fit(
         found += register(old.cloud, past, target, ground.up, ground.search, extra)
         if min(c.score for c in found) <= ground.search.enough:
             break
-    found.sort(key=lambda c: c.score)
+    return _likeliest(ground, old, olds, past, found, ground.believe.gains)
+
+
+def _likeliest(
+    ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past], found: Sequence[Candidate], gains: float
+) -> Fit | None:
+    """The best of some candidates once the likelier ones are refined."""
+    found = sorted(found, key=lambda c: c.score)
     if not found:
         return None
     most = min(ground.believe.fits, found[0].score + 0.1)
     likely = [c.new_from_old for c in found[: ground.believe.refined] if c.score <= most]
-    return _refined(ground, old, olds, past, likely, found[0].score)
+    return _refined(ground, old, olds, past, likely, found[0].score, gains)
+
+
+def slid(ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past]) -> Fit | None:
+    """The pose change of an object that may have slid by less than its width, so that it hides where it was.
+
+    It explains hardly more pixels than it did where it was: whether it slid is not said here.
+    """
+    wanted = []
+    for p in past:
+        stays = ~pixels.dilate(p.changed.mask | p.changed.light | p.covered | silhouette(p.view, old), 3)
+        wanted.append(-stays.astype(np.float32))
+    target = Target(old.centre[None].astype(np.float32), tuple(wanted))
+    found = register(old.cloud, past, target, ground.up, ground.search)
+    return _likeliest(ground, old, olds, past, found, gains=0.0)
 
 
 def _refined(
-    ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past], poses: Sequence[Tensor], score: float
+    ground: Ground,
+    old: Old,
+    olds: Sequence[Old],
+    past: Sequence[Past],
+    poses: Sequence[Tensor],
+    score: float,
+    gains: float,
 ) -> Fit | None:
-    """The best of some poses of an object, refined; None if the photos do not show it there."""
+    """The best of some poses of an object, refined; None if the photos do not show it there.
+
+    ``gains``: the part of its pixels by which they must show more of it than of what was there.
+    """
     believe = ground.believe
     best: PoseChange | None = None
     sight = Sight(ground.field, old, past, olds)
@@ -153,7 +183,7 @@ def _refined(
         return None
     old, best = trimmed(ground, sight, best)
     least = believe.explains * min(1.0, max(0.5, shown_right(ground, old, past) / believe.shown))
-    gains = believe.gains * (2 if best.before > believe.alike else 1)
+    gains *= 2 if best.before > believe.alike else 1
     if is_sunk(ground, old, best):  # possible, off the edge of a table; but a crumb of floor fits anywhere
         least = max(least, ground.believe.sunk)
     if best.explained < max(least, best.before + gains):

@@ -26,7 +26,7 @@ ALL, COARSEST, FINER = slice(None), slice(0, 1), slice(1, None)
 _SURE = 1e-3  # of a colour; no picture is more exact
 _DARK = 0.02  # what is as dark as this says little about its light
 _BRIGHTER = 2.5  # times, at most, that the object may be at its new place
-_SIDE = 0.35  # of the radius; light on a side is even over this much when a pose is judged
+SIDE = 0.35  # of the radius; light on a side is even over this much when a pose is judged
 
 
 @dataclass(frozen=True)
@@ -237,5 +237,5 @@ def _described(
     covariance = unit[:, None] * covariance * unit[None]
     free = int((held < c.unseen).sum())
     note = f"the photos do not show its turn about {'any axis' if free == 3 else f'{free} of 3 axes'}" if free else ""
-    part, before, count = explained(ready.compared(pose), _SIDE * ready.apparent)
+    part, before, count = explained(ready.compared(pose), SIDE * ready.apparent)
     return PoseChange(pose, covariance, noise, part, before, count, ready.pixel, note)

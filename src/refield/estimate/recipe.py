@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 import torch
 
-from refield.estimate import associate, detect, hull, light, look
-from refield.estimate.associate import Settled, is_crumb, looks_gone, unexplained
+from refield.estimate import detect, hull, light, look
+from refield.estimate.associate import is_crumb
 from refield.estimate.conclude import Told, concluded, disagreeing
 from refield.estimate.detect import Changed, DetectConfig, Errors, Mask
 from refield.estimate.faces import Parts, changed_parts
@@ -18,6 +18,7 @@ from refield.estimate.ground import AssociateConfig, Ground
 from refield.estimate.hull import Hull, HullConfig
 from refield.estimate.lattice import Lattice, Voxels, grown
 from refield.estimate.light import SAME_PLACE
+from refield.estimate.likelihood import Settled
 from refield.estimate.look import Array, View
 from refield.estimate.memory import Memory
 from refield.estimate.models import ModelConfig, Models
@@ -29,6 +30,7 @@ from refield.estimate.paper.route import estimate_change_paper
 from refield.estimate.place import PlaceConfig, place
 from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
+from refield.estimate.settle import looks_gone, settle, unexplained
 from refield.field.radiance import Field, check_field
 from refield.field.source import Known
 from refield.scene.capture import Capture, Frame, check_capture, check_frames
@@ -147,10 +149,10 @@ def estimate_change(
         field, carved, free, up, scene.planes, scene.survey, scene.errors.memory, photographed,
         config.detect, config.hull, config.objects, config.associate, config.register, config.refine, models.matcher,
     )  # fmt: skip
-    settled = associate.settle(ground, olds, scene.changed)
+    settled = settle(ground, olds, scene.changed)
     more = _overlooked(scene, ground, settled, parts, olds) if parts.things else []
     if more:
-        settled = associate.settle(ground, _whole([*olds, *more]), scene.changed)
+        settled = settle(ground, _whole([*olds, *more]), scene.changed)
     say("segment")
     answer = concluded(Told(field, capture.train, scene.changed, photos, carved, scene.errors), settled)
     return replace(answer, why=answer.why + _never_seen(scene.changed))

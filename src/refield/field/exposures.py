@@ -52,10 +52,9 @@ class ExposureFit:
     def learn(self, owner: Tensor, basis: Tensor, seen: Tensor, errors: Tensor, place: Tensor, rate: float) -> None:
         """Follow a step: what was seen in the photos' exposure and its error, (N, 3) each; where the rays end, (N,),
         -1: nowhere; ``rate`` in [0, 1]."""
-        ends = place >= 0
-        owner, basis, seen, errors, place = owner[ends], basis[ends], seen[ends], errors[ends], place[ends]
-        weight, slope = seen.square().mean(-1, keepdim=True), seen * errors
-        at, camera = owner * self._weights.shape[1] + place, self.camera_of[owner]
+        ends = (place >= 0)[:, None]
+        weight, slope = ends * seen.square().mean(-1, keepdim=True), ends * seen * errors
+        at, camera = owner * self._weights.shape[1] + place.clamp_min(0), self.camera_of[owner]
         self._weights.view(-1, 4).index_add_(0, at, torch.cat([weight, weight * basis], -1))
         self._slopes.view(-1, 3).index_add_(0, at, slope)
         self._bend.index_add_(0, camera, (weight * basis)[:, :, None] * basis[:, None])

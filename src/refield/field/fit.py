@@ -12,7 +12,7 @@ import torch
 
 from refield.field import kernels
 from refield.field.compiling import Compiling, compiling
-from refield.field.coverage import beside, knowable
+from refield.field.coverage import beside
 from refield.field.descent import NonFiniteError, TableAdam
 from refield.field.encoding import Contraction
 from refield.field.kernels.reference import Aim
@@ -52,6 +52,8 @@ class FitConfig:
     """weight of the distortion loss; without it fog fills the grid"""
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera"""  # §10.1
+    directions: bool = True
+    """let colours depend on the direction from which they are seen"""
     photos: PhotoModelConfig = field(default_factory=PhotoModelConfig)
     """what is found out about the photos, beside the field"""
     size: PhotoSizeConfig = field(default_factory=PhotoSizeConfig)
@@ -181,8 +183,7 @@ def fit_capture(
         model = new_field(capture, config, seed, core) if start is None else opened(start)
         try:
             if config.device == "cuda":
-                _fit_on_gpu(model, photos, config, on_progress, on_step)
-                found = capture
+                found = _fit_on_gpu(model, capture, photos, config, on_progress, on_step)
             else:
                 may_give_up = start is None and attempt < _TRIES - 1
                 run = _Fit(model, photos, config, on_progress, on_step, began=began, goes_on=goes_on)
@@ -216,15 +217,18 @@ def _core(capture: Capture) -> Contraction:
 
 def _fit_on_gpu(
     model: HashField,
+    capture: Capture,
     photos: Photos,
     config: FitConfig,
     on_progress: ProgressCallback | None,
     on_step: StepCallback | None,
-) -> None:
+) -> Capture:
     need_device(config.device)
+    if not config.directions or photos.since.share is not None:
+        raise InputError("device cuda", "draws all pixels alike, in colours that depend on the direction", "fit on cpu")
     from refield.field.gpu_fit import fit_on_gpu
 
-    fit_on_gpu(model, photos, config, on_progress, on_step)
+    return fit_on_gpu(model, capture, photos, config, on_progress, on_step)
 
 
 def need_device(device: str) -> None:
@@ -253,11 +257,13 @@ class _Fit:
     ) -> None:
         self.goes_on = goes_on
         self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
-        self.pixels, self.judge = photos.bank(), photos.judge()
+        self.taught, self.pixels, self.judge = photos, photos.bank(), photos.judge()
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model, config.decay or 0.0)
+        if not config.directions:
+            self.adam.parameters[COLOUR_IN].detach()[:, -DIRECTED:] = 0
         self.plain = not self.adam.parameters[COLOUR_IN][:, -DIRECTED:].any()
-        allowed, outside = knowable(model.sampler, photos.train), stand_outside(model.contraction, photos.train)
+        allowed, outside = photos.knowable(model.sampler), stand_outside(model.contraction, photos.train)
         near = beside(model.sampler, photos.train) if outside else None
         self.occupancy = OccupancyTrainer(model, allowed=allowed, outside=outside, beside=near)
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
@@ -278,11 +284,15 @@ class _Fit:
             with compiling() as self.compiling:
                 self._steps(may_give_up)
         except NonFiniteError:
-            self.occupancy.settle(self.pixels)
+            self._settle()
             raise
-        self.occupancy.settle(self.pixels)
+        self._settle()
         if self.on_progress:
             self._look(self.steps_done)
+
+    def _settle(self) -> None:
+        self.occupancy.settle(self.pixels)
+        self.model.sampler = self.model.sampler.for_pictures()
 
     def _steps(self, may_give_up: bool) -> None:
         looks: list[float] = []
@@ -322,7 +332,7 @@ class _Fit:
             self.photos.exposing = self.judge.tells_exposures(self.model)
             self.model.train()
         n = self.rays_per_step
-        asked = self.photos.ask(torch.randint(len(self.pixels), (n,)), progress)
+        asked = self.photos.ask(self.taught.drawn(self.pixels, n), progress)
         model, sampler = self.model, self.model.sampler
         space = (sampler.contraction.centre, sampler.contraction.radius)
         aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
@@ -330,7 +340,7 @@ class _Fit:
         where = (space, sampler.grid, sampler.lattice)
         done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, fine=sampler.fine)
         rate = rate_factor((1 + progress) / 2 if self.goes_on else progress)
-        if self.plain and self.photos.plain(progress):
+        if not self.config.directions or (self.plain and self.photos.plain(progress)):
             self.adam.grads[COLOUR_IN][:, -DIRECTED:] = 0
         if self.adam.step(self.config.rate * rate, done.loss):
             self.loss = done.loss if math.isnan(self.loss) else self.loss + 0.03 * (done.loss - self.loss)

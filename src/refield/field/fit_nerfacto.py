@@ -18,7 +18,7 @@ from refield.field.losses import colour_loss, distortion_loss, scale_gradients
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
 from refield.field.photo_size import PhotoSizeConfig, as_read, at_full_size
-from refield.field.photos import UNCHANGED, Photos
+from refield.field.photos import UNCHANGED, Photos, Since
 from refield.field.placing import DIRECTED, place_contraction
 from refield.field.proposal import Histogram, annealing
 from refield.field.sampling import OccupancySampler
@@ -97,20 +97,27 @@ REDUCED = NerfactoFitConfig(
 
 
 def fit_nerfacto(
-    capture: Capture, config: NerfactoFitConfig = NerfactoFitConfig(), on_progress: ProgressCallback | None = None
+    capture: Capture,
+    config: NerfactoFitConfig = NerfactoFitConfig(),
+    on_progress: ProgressCallback | None = None,
+    *,
+    since: Since = UNCHANGED,
 ) -> Fitted[NerfactoField]:
     """Fit a NeRFacto field to the capture's training frames.
+
+    ``since``: newer photos to learn from as well, and pixels of the capture that are out of date; what it says to be
+    empty is not heeded.
 
     Raises:
         ValueError: no frame to train on.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row; it holds the last good state.
     """
-    capture, _ = as_read(capture, UNCHANGED, config.size)
+    capture, since = as_read(capture, since, config.size)
     if not capture.train:
         raise ValueError("the capture has no frame to train on")
     torch.manual_seed(config.seed)
     model = NerfactoField(config.field, looking_everywhere(place_contraction(capture), config.field), config.seed)
-    fit = _NerfactoFit(model, capture, config, on_progress)
+    fit = _NerfactoFit(model, Photos.of(capture, since), config, on_progress)
     try:
         fit.run()
     except NonFiniteError as error:
@@ -134,11 +141,10 @@ class _NerfactoFit:
     """The state of one run of :func:`fit_nerfacto`."""
 
     def __init__(
-        self, model: NerfactoField, capture: Capture, config: NerfactoFitConfig, on_progress: ProgressCallback | None
+        self, model: NerfactoField, photos: Photos, config: NerfactoFitConfig, on_progress: ProgressCallback | None
     ) -> None:
         self.model, self.config, self.on_progress = model, config, on_progress
-        photos = Photos.of(capture)
-        self.judge = photos.judge()
+        self.taught, self.judge = photos, photos.judge()
         self.photos = PhotoModel(photos.bank(), model.sampler, config.photos)
         if config.photos.exposures:  # see `PhotoModel.plain`
             with torch.no_grad():
@@ -170,7 +176,7 @@ class _NerfactoFit:
         if self.photos.may_expose(progress):
             self.photos.exposing = self.judge.tells_exposures(cast(Any, self.model))
             self.model.train()
-        asked = self.photos.ask(torch.randint(len(self.photos.bank), (self.config.rays,)), progress)
+        asked = self.photos.ask(self.taught.drawn(self.photos.bank, self.config.rays), progress)
         learning = step - self.proposed >= proposal_interval(step, self.config)
         ways = Rays(*(r.detach().requires_grad_(asked.batch.moving > 0) for r in asked.batch.rays[:2]))
         loss, done = self._loss(asked.batch, ways, step, learning)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from refield.field.coverage import beside, knowable
+from refield.field.coverage import beside
 from refield.field.descent import FADE_EVERY, MOST_SKIPPED, NonFiniteError, fading
 from refield.field.encoding import Contraction
 from refield.field.fit import (
@@ -22,12 +22,13 @@ from refield.field.fit import (
 from refield.field.graphed import Descent, DevicePixels, GraphedStep
 from refield.field.kernels.reference import Aim
 from refield.field.occupancy import DECAY, EVERY, OccupancyTrainer
+from refield.field.photo_model import PhotoModel
 from refield.field.photos import Photos
-from refield.field.placing import stand_outside
+from refield.field.placing import COLOUR_IN, DIRECTED, stand_outside
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP
 from refield.field.schedule import at_plateau, rate_factor
-from refield.scene.capture import Rays
+from refield.scene.capture import Capture
 
 _BATCH = 32  # times the samples of a step on a CPU: fewer would leave most of the chip idle
 # two sizes an octave: a step's room for samples is at least half full, and few graphs are captured
@@ -37,12 +38,14 @@ _ROOM = 0.95  # of the samples' room is aimed at; what overflows is left out
 
 def fit_on_gpu(
     model: HashField,
+    capture: Capture,
     photos: Photos,
     config: FitConfig,
     on_progress: ProgressCallback | None = None,
     on_step: StepCallback | None = None,
-) -> None:
-    """Fit a field to photos on the current CUDA device; the model comes back to where it was.
+) -> Capture:
+    """Fit a field to photos on the current CUDA device; the model comes back to where it was. Returns the capture with
+    what the fit found out about its photos.
 
     As many steps as on a CPU, each of 32 times the samples. ``on_step`` hears every 16th.
 
@@ -50,12 +53,14 @@ def fit_on_gpu(
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row.
     """
     home, device = model.encoding.tables.device, torch.device("cuda", torch.cuda.current_device())
-    known = knowable(model.sampler, photos.train).to(device), beside(model.sampler, photos.train).to(device)
+    known = photos.knowable(model.sampler).to(device), beside(model.sampler, photos.train).to(device)
     outside = stand_outside(model.contraction, photos.train)
     move(model, device)
     try:
         with torch.device(device):  # what is made in here without a device named is made on the GPU
-            _GpuFit(model, photos, config, (known, outside), (on_progress, on_step)).run()
+            fit = _GpuFit(model, photos, config, (known, outside), (on_progress, on_step))
+            fit.run()
+            return fit.photos.told(capture, fit.judge, model)
     finally:
         move(model, home)
 
@@ -80,7 +85,7 @@ class _GpuFit:
         places: tuple[tuple[torch.Tensor, torch.Tensor], bool],
         told: tuple[ProgressCallback | None, StepCallback | None],
     ) -> None:
-        """``places``: cells that are `knowable`, and those `beside` cameras; whether these `stand_outside`."""
+        """``places``: cells that are `Photos.knowable`, and those `beside` cameras; whether these `stand_outside`."""
         (allowed, near), outside = places
         self.on_progress, self.on_step = told
         self.model, self.config = model, config
@@ -88,14 +93,13 @@ class _GpuFit:
         with torch.device("cpu"):  # photos are read and posed there
             self.pixels = DevicePixels(photos.bank(), device)
             self.judge = photos.judge()
-        if self.judge.rays is not None:
-            r = self.judge.rays
-            self.judge.rays = Rays(r.origins.to(device), r.directions.to(device))
-            self.judge.truth = self.judge.truth.to(device)
+        self.judge.move(device)
+        self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.occupancy = OccupancyTrainer(model, allowed=allowed, outside=outside, beside=near if outside else None)
         model.looking_where(allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.grid = model.sampler.grid.clone()  # the one that graphs read
         self.descent = Descent(model)
+        self.plain = not self.descent.networks[COLOUR_IN - 1][:, -DIRECTED:].any()
         self.capacity = config.samples * _BATCH
         self.rays_per_step, self.coarseness = _SIZES[0], COARSEST
         self.finest_step = model.sampler.step
@@ -106,10 +110,14 @@ class _GpuFit:
         try:
             samples = self._steps()
         except NonFiniteError:
-            self.occupancy.settle(self.pixels)  # type: ignore[arg-type]
+            self._settle()
             raise
-        self.occupancy.settle(self.pixels)  # type: ignore[arg-type]
+        self._settle()
         self._look(self.step, samples / self.rays_per_step)
+
+    def _settle(self) -> None:
+        self.occupancy.settle(self.pixels)
+        self.model.sampler = self.model.sampler.for_pictures()
 
     def _steps(self) -> int:
         """All rounds of steps, each followed by what a graph cannot hold; returns the samples of the last step."""
@@ -117,6 +125,7 @@ class _GpuFit:
         due = self.config.check_every
         graph, step = self._captured(0)
         while progress_of(self.config, step, self.began) < 1:
+            stage = self.photos.stage(graph.progress)
             step = self._round(graph, step)
             self.step, samples = step, int(graph.samples)
             if self.on_step:
@@ -128,7 +137,7 @@ class _GpuFit:
                 looks.append(self._look(step, samples / self.rays_per_step))
                 if at_plateau(looks, self.config):
                     break
-            if self._resized(samples):
+            if self._resized(samples) or self.photos.stage(self._expose(step)) != stage:
                 graph, step = self._captured(step)
         return int(graph.samples)
 
@@ -138,6 +147,7 @@ class _GpuFit:
         for _ in range(EVERY - step % EVERY):
             self._set_rate(step)
             graph.replay()
+            self._learn(graph, step)
             step += 1
             self.rays_done += self.rays_per_step
         if self.config.decay and step % FADE_EVERY == 0:
@@ -154,10 +164,26 @@ class _GpuFit:
         aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
         where = (space, self.grid, sampler.lattice, self.model.encoding.resolutions)
         occupancy = (self.occupancy.state, DECAY)
-        graph = GraphedStep(self.descent, self.pixels, where, aim, occupancy, (self.rays_per_step, self.capacity))
+        graph = GraphedStep(self.descent, self.photos, where, aim, occupancy, (self.rays_per_step, self.capacity))
+        graph.progress = self._expose(step)
+        graph.plain = self.plain and self.photos.plain(graph.progress)
         graph.now.fill_(self.occupancy.rounds)
         self._set_rate(step)
         return graph, step + graph.capture()
+
+    def _expose(self, step: int) -> float:
+        """How far the fit is; and find out, when that is due, whether photos are exposed alike."""
+        progress = progress_of(self.config, step, self.began)
+        if self.photos.may_expose(max(step / self.config.steps, progress / 2)):
+            self.photos.exposing = self.judge.tells_exposures(self.model)
+            self.model.train()
+        return progress
+
+    def _learn(self, graph: GraphedStep, step: int) -> None:
+        """What a replay found goes to the photos; outside of the graph, since it solves equations."""
+        assert graph.asked is not None and graph.found is not None
+        progress = progress_of(self.config, step, self.began)
+        self.photos.learn(graph.asked, graph.found, progress, rate_factor(progress))
 
     def _set_rate(self, step: int) -> None:
         self.descent.rate.fill_(self._rate(step))
@@ -182,7 +208,8 @@ class _GpuFit:
         return (self.rays_per_step, self.coarseness) != (rays, coarseness)
 
     def _look(self, step: int, samples_per_ray: float) -> float:
-        psnr = self.judge.psnr(self.model)
+        self.photos.inform(self.judge)
+        psnr = self.judge.psnr(self.model, self.photos.exposing)
         self.model.train()
         if self.on_progress:
             seconds = time.perf_counter() - self.began

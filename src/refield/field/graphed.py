@@ -12,10 +12,13 @@ import torch
 from torch import Tensor
 
 from refield.field.kernels import gpu
-from refield.field.kernels.reference import Aim, Batch, Lattice, Space
+from refield.field.kernels.reference import Aim, Lattice, Space, Stepped
+from refield.field.photo_model import Asked, PhotoModel
 from refield.field.pixels import PixelBank
+from refield.field.placing import COLOUR_IN, DIRECTED
 from refield.field.radiance import HashField
 from refield.scene.capture import Rays
+from refield.scene.exposure import vignetting_basis
 
 _WARM = 3  # steps before a capture: kernels are compiled and workspaces allocated in them
 
@@ -24,14 +27,17 @@ class DevicePixels:
     """A `PixelBank` on a device: rays and colours by table look-ups alone, whatever cameras the pixels belong to."""
 
     def __init__(self, bank: PixelBank, device: torch.device) -> None:
+        self.frames = bank.frames
         cameras = list(dict.fromkeys(f.camera for f in bank.frames))
+        camera_of = torch.tensor([cameras.index(f.camera) for f in bank.frames])
         tables = [c.unproject(c.pixel_centres()).float() for c in cameras]
         begins = torch.tensor([0, *(len(t) for t in tables)]).cumsum(0)
         self._count = len(bank)
-        self._rgb, self._starts = bank.rgb.to(device), bank.starts.to(device)
+        self._rgb, self.starts = bank.rgb.to(device), bank.starts.to(device)
         self._places = None if bank.places is None else bank.places.to(device)
         self._directions = torch.cat(tables).to(device)  # of every pixel of every distinct camera, in camera axes
-        self._begins = begins[[cameras.index(f.camera) for f in bank.frames]].to(device)
+        self._begins = begins[camera_of].to(device)
+        self._sizes = torch.tensor([(c.width, c.height) for c in cameras])[camera_of].to(device)
         self._rotations = torch.stack([f.world_from_cam[:3, :3] for f in bank.frames]).float().to(device)
         self._centres = torch.stack([f.centre for f in bank.frames]).float().to(device)
 
@@ -40,14 +46,29 @@ class DevicePixels:
 
     def frame_of(self, pixels: Tensor) -> Tensor:
         """Index of the frame that owns each pixel, (B,) -> (B,)."""
-        return torch.searchsorted(self._starts, pixels, right=True) - 1
+        return torch.searchsorted(self.starts, pixels, right=True) - 1
 
     def rays(self, pixels: Tensor) -> Rays:
         """World rays through pixel centres, (B,) -> Rays of B."""
         owner = self.frame_of(pixels)
-        local = pixels - self._starts[owner] if self._places is None else self._places[pixels]
-        d = self._directions[self._begins[owner] + local]
+        d = self.camera_directions(pixels, owner)
         return Rays(self._centres[owner], (self._rotations[owner] * d[:, None, :]).sum(-1))
+
+    def place_of(self, pixels: Tensor) -> Tensor:
+        """Each pixel's place in its photo, row by row, (B,) -> (B,) int64."""
+        return self._place_of(pixels, self.frame_of(pixels))
+
+    def _place_of(self, pixels: Tensor, owner: Tensor) -> Tensor:
+        return pixels - self.starts[owner] if self._places is None else self._places[pixels].long()
+
+    def camera_directions(self, pixels: Tensor, owner: Tensor) -> Tensor:
+        """Unit directions in camera axes through the centres of pixels (B,) of photos ``owner`` (B,), (B, 3)."""
+        return self._directions[self._begins[owner] + self._place_of(pixels, owner)]
+
+    def vignetting_basis(self, pixels: Tensor, owner: Tensor) -> Tensor:
+        """`refield.scene.exposure.vignetting_basis` at pixels (B,) of photos ``owner`` (B,), (B, 3)."""
+        place, size = self._place_of(pixels, owner), self._sizes[owner]
+        return vignetting_basis(torch.stack([place % size[:, 0], place // size[:, 0]], -1) + 0.5, size)
 
     def colours(self, pixels: Tensor) -> Tensor:
         """(B,) -> (B, 3) float32 in [0, 1]."""
@@ -93,21 +114,29 @@ class GraphedStep:
     """Draw N pixels, march, evaluate, composite, compare, descend, and note what was seen where.
 
     Grid and occupancy state are read and written in place at every replay; ``descent.rate`` and ``now`` may be set
-    between replays. The lattice is part of the graph.
+    between replays, and what ``photos`` know may change in place. The lattice is part of the graph, and so is the
+    stage of the fit at which the photos are asked (`PhotoModel.stage`).
     """
 
     def __init__(
         self,
         descent: Descent,
-        pixels: DevicePixels,
+        photos: PhotoModel,
         where: tuple[Space, Tensor, Lattice, tuple[int, ...]],
         aim: Aim,
         occupancy: tuple[Tensor, float],
         size: tuple[int, int],
     ) -> None:
-        """``where``: space, grid (R, R, R) uint8, lattice, levels; ``occupancy``: see `reference.observe`, state and
-        decay; ``size``: N and S."""
-        self.descent, self.pixels, self.where, self.aim, self.occupancy = descent, pixels, where, aim, occupancy
+        """``photos`` have `DevicePixels`; ``where``: space, grid (R, R, R) uint8, lattice, levels; ``occupancy``: see
+        `reference.observe`, state and decay; ``size``: N and S."""
+        self.descent, self.photos, self.where, self.aim, self.occupancy = descent, photos, where, aim, occupancy
+        self.progress = 0.0
+        """of the fit, in [0, 1]; heeded when the step is captured"""
+        self.plain = False
+        """whether colours do not learn from where they are seen; heeded likewise"""
+        self.asked: Asked | None = None
+        self.found: Stepped | None = None
+        """what the last step looked at, and what it found: where replays write it; nothing, of a step left out"""
         self.rays, self.capacity = size
         self._device = descent.tables.device
         self.now = torch.ones((), device=self._device)
@@ -120,16 +149,16 @@ class GraphedStep:
     def run_eager(self) -> None:
         """One step, launch by launch."""
         space, grid, lattice, resolutions = self.where
-        chosen = torch.randint(len(self.pixels), (self.rays,), device=self._device)
-        rays = self.pixels.rays(chosen)
-        jitter = torch.rand(self.rays, device=self._device)
-        # what stays transparent is shown noise, so that only opaque surfaces explain the photos
-        background = torch.rand(self.rays, 3, device=self._device)
-        batch = Batch((rays.origins, rays.directions, jitter), self.pixels.colours(chosen), background)
+        chosen = torch.randint(len(self.photos.bank), (self.rays,), device=self._device)
+        self.asked = self.photos.ask(chosen, self.progress)
         field = (self.descent.tables, resolutions, self.descent.networks)
-        found = gpu.train_step(batch, space, grid, lattice, field, self.aim, self.descent.into, capacity=self.capacity)
+        into, capacity = self.descent.into, self.capacity
+        found = gpu.train_step(self.asked.batch, space, grid, lattice, field, self.aim, into, capacity=capacity)
+        if self.plain:
+            into[COLOUR_IN][:, -DIRECTED:] = 0
         loss: Tensor = found.loss  # type: ignore[assignment]
         good = self.descent.step(loss)
+        self.found = _taught(found, good)
         state, decay = self.occupancy
         gpu.observe(state, self.now, decay, found.cells, torch.where(good, found.weights, -1.0), found.sigmas)
         self.loss.copy_(loss)
@@ -153,3 +182,17 @@ class GraphedStep:
         if self._graph is None:
             raise RuntimeError("the step was not captured: call capture() first")
         self._graph.replay()
+
+
+def _taught(found: Stepped, good: Tensor) -> Stepped:
+    """What a step found, for the photos to learn from: nothing, unless it was ``good`` () bool."""
+    assert found.shown is not None and found.errors is not None and found.heaviest is not None
+    to_rays = None
+    if found.to_rays is not None:
+        to_rays = torch.where(good, found.to_rays[0], 0.0), torch.where(good, found.to_rays[1], 0.0)
+    return found._replace(
+        shown=torch.where(good, found.shown, 0.0),
+        errors=torch.where(good, found.errors, 0.0),
+        heaviest=torch.where(good, found.heaviest, -1),
+        to_rays=to_rays,
+    )

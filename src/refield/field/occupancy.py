@@ -8,7 +8,7 @@ from torch import Tensor
 from refield.field import kernels
 from refield.field.encoding import large_zeros
 from refield.field.parts import Parts
-from refield.field.pixels import PixelBank
+from refield.field.pixels import Pixels
 from refield.field.radiance import HashField
 from refield.field.render import CHUNK
 from refield.field.volrend import weights
@@ -136,7 +136,7 @@ class OccupancyTrainer:
         grid = kernels.keep(self.state, allowed, opacity, weight, only_seen)
         return grid.reshape(self.model.sampler.grid.shape)
 
-    def settle(self, pixels: PixelBank) -> None:
+    def settle(self, pixels: Pixels) -> None:
         """The final grid: every opaque cell that some training ray sees, without the parts that are known to be empty.
 
         Leaves the model in training mode.

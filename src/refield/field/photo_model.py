@@ -13,7 +13,7 @@ from torch import Tensor
 from refield.field.exposures import ExposureFit
 from refield.field.kernels.reference import Batch, Stepped
 from refield.field.photos import HeldOut
-from refield.field.pixels import PixelBank
+from refield.field.pixels import Pixels
 from refield.field.poses import PoseFit
 from refield.field.radiance import Field
 from refield.field.sampling import OccupancySampler
@@ -56,10 +56,11 @@ class Asked(NamedTuple):
 class PhotoModel:
     """See the module."""
 
-    def __init__(self, bank: PixelBank, sampler: OccupancySampler, config: PhotoModelConfig) -> None:
+    def __init__(self, bank: Pixels, sampler: OccupancySampler, config: PhotoModelConfig) -> None:
         self.bank = bank
         frames = bank.frames
-        distance = torch.stack([f.centre.float() - sampler.contraction.centre for f in frames]).norm(dim=-1).median()
+        middle = sampler.contraction.centre.cpu()
+        distance = torch.stack([f.centre.float() - middle for f in frames]).norm(dim=-1).median()
         self._side = sampler.resolution
         self._across = min(_PLACES, self._side)
         places = self._across**3
@@ -84,6 +85,12 @@ class PhotoModel:
             return False
         return progress < _PLAIN if self.exposing else not self._asked_whether
 
+    def stage(self, progress: float) -> tuple[bool, ...]:
+        """What of all this is asked of a step, at ``progress`` of the fit: steps of one stage are alike."""
+        trusting, posing = self.trust is not None, self.poses is not None
+        heeded = trusting and progress >= _TRUSTED_FROM, posing and progress >= _POSED_FROM
+        return self.exposing, self.plain(progress), *heeded
+
     def ask(self, pixels: Tensor, progress: float) -> Asked:
         """Rays of pixels (N,) as they stand, with the photos' gains and trust; ``progress`` of the fit in [0, 1]."""
         bank, n = self.bank, len(pixels)
@@ -101,8 +108,9 @@ class PhotoModel:
             trust = self.trust.trust[patches]
         moving = n // _MOVING if self.poses is not None and progress >= _POSED_FROM else 0
         # what stays transparent is shown noise, so that only opaque surfaces explain the photos
-        lines = (rays.origins, rays.directions, torch.rand(n))
-        batch = Batch(lines, bank.colours(pixels), torch.rand(n, 3), gains, trust, moving)
+        lines = (rays.origins, rays.directions, torch.rand(n, device=pixels.device))
+        background = torch.rand(n, 3, device=pixels.device)
+        batch = Batch(lines, bank.colours(pixels), background, gains, trust, moving)
         return Asked(batch, pixels, owner, basis, patches)
 
     def learn(self, asked: Asked, done: Stepped, progress: float, rate: float) -> None:

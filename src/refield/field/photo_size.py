@@ -57,14 +57,15 @@ def as_read(capture: Capture, since: Since, config: PhotoSizeConfig) -> tuple[Ca
 
     A pixel that is averaged from some that are out of date is out of date.
     """
-    frames = (*capture.frames, *since.frames)
+    frames = (*capture.frames, *since.carried, *since.frames)
     parts = _parts(frames, config)
     if all(part == 1 for part in parts):
         return capture, since
     smaller = tuple(f.shrunk(part) for f, part in zip(frames, parts))
-    old, new = smaller[: len(capture.frames)], smaller[len(capture.frames) :]
-    valid = {f.name: _shrunk(since.valid[f.name], f) for f in old if f.name in since.valid}
-    return replace(capture, frames=old), Since(new, valid)
+    first, last = len(capture.frames), len(frames) - len(since.frames)
+    old, carried, new = smaller[:first], smaller[first:last], smaller[last:]
+    valid = {f.name: _shrunk(since.valid[f.name], f) for f in old + carried if f.name in since.valid}
+    return replace(capture, frames=old), replace(since, frames=new, carried=carried, valid=valid)
 
 
 def at_full_size(capture: Capture) -> Capture:

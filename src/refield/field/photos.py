@@ -9,12 +9,15 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
+from refield.field.coverage import knowable
 from refield.field.kernels.reference import BURNT
-from refield.field.pixels import PixelBank
+from refield.field.pixels import PixelBank, Pixels
 from refield.field.radiance import Field
 from refield.field.render import render_many
+from refield.field.sampling import OccupancySampler
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, Rays, camera_rays
+from refield.scene.change import OccupancyGrid
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,14 @@ class Since:
     frames: tuple[Frame, ...] = ()
     """photos taken since; all of their pixels teach, and none is held out"""
     valid: Mapping[str, Tensor] = field(default_factory=dict)
-    """name of a frame of the capture -> (H, W) bool: its pixels that still show the scene; all, for those not named"""
+    """name of a frame of the capture, or of those carried -> (H, W) bool: its pixels that show the scene as it is; all,
+    for those not named"""
+    carried: tuple[Frame, ...] = ()
+    """older photos of something that moved, from where they would have been taken now; none is held out"""
+    share: float | None = None
+    """of each step's rays drawn from ``frames``; None: all pixels alike, old and new"""
+    empty: tuple[OccupancyGrid, ...] = ()
+    """what is known to hold nothing any more"""
 
 
 UNCHANGED = Since()
@@ -42,17 +52,20 @@ class Photos:
     """the same of the held-out frames"""
     most: int | None = None
     """of more pixels so many are kept, drawn from every photo alike"""
+    since: Since = UNCHANGED
+    """whose photos are the last of those to train on"""
 
     @staticmethod
     def of(capture: Capture, since: Since = UNCHANGED, most: int | None = None) -> Photos:
         """Raises ValueError if there is nothing to learn from."""
-        train, held = capture.train + since.frames, capture.held_out
+        older, held = capture.train + since.carried, capture.held_out
+        train = older + since.frames
         if not train:
             raise ValueError("the capture has no frame to train on")
-        taught = *(since.valid.get(f.name) for f in capture.train), *(None for _ in since.frames)
+        taught = *(since.valid.get(f.name) for f in older), *(None for _ in since.frames)
         if not any(mask is None or mask.any() for mask in taught):
             raise ValueError("no pixel of the capture is left to train on")
-        return Photos(train, held, taught, tuple(since.valid.get(f.name) for f in held), most)
+        return Photos(train, held, taught, tuple(since.valid.get(f.name) for f in held), most, since)
 
     def bank(self) -> PixelBank:
         """The pixels that teach."""
@@ -61,6 +74,24 @@ class Photos:
     def judge(self) -> HeldOut:
         """The pixels that do not."""
         return HeldOut(self.held_out, masks=self.judged)
+
+    def drawn(self, bank: Pixels, count: int) -> Tensor:
+        """Indices (count,) of pixels of the bank, at random; of the photos taken since, the share that they are to
+        have."""
+        newer = int(bank.starts[len(self.train) - len(self.since.frames)])
+        if self.since.share is None or newer in (0, len(bank)):
+            return torch.randint(len(bank), (count,))
+        new = round(count * self.since.share)
+        return torch.cat([torch.randint(newer, (count - new,)), torch.randint(newer, len(bank), (new,))])
+
+    def knowable(self, sampler: OccupancySampler) -> Tensor:
+        """(R**3,) bool: cells that may hold something, by the cameras (`coverage.knowable`) and by what is known to
+        hold nothing any more."""
+        allowed = knowable(sampler, self.train)
+        for grid in self.since.empty:
+            cells = sampler.cells_in(grid.tight_aabb())
+            allowed[cells[grid.contains(sampler.points_in(cells, jitter=False))]] = False
+        return allowed
 
 
 # dB. Left-out photos of four real scenes, as they are, gained -0.05 to 0.08 in seven fits; those of one scene with half
@@ -97,14 +128,21 @@ class HeldOut:
         """What has become known of the photos' lenses, of each one's as it is now, and of their vignetting (F, 3)."""
         if self.rays is None:
             return
-        device, directions = self.rays.origins.device, torch.empty(len(self._places), 3)
-        for i, (frame, camera) in enumerate(zip(self.frames, cameras)):
-            mine = self.owner == i
-            place = self._places[mine]
-            pixels = torch.stack([place % camera.width, place // camera.width], -1) + 0.5
-            directions[mine] = camera_rays(camera, frame.world_from_cam, pixels).directions
-        self.rays = Rays(self.rays.origins, directions.to(device))
-        self._fallen = (vignetting[self.owner] * self._basis).sum(-1, keepdim=True).exp()
+        owner = self.owner.cpu()
+        with torch.device("cpu"):
+            directions = torch.empty(len(self._places), 3)
+            for i, (frame, camera) in enumerate(zip(self.frames, cameras)):
+                place = self._places[owner == i]
+                pixels = torch.stack([place % camera.width, place // camera.width], -1) + 0.5
+                directions[owner == i] = camera_rays(camera, frame.world_from_cam, pixels).directions
+        self.rays = Rays(self.rays.origins, directions.to(self.rays.origins))
+        self._fallen = (vignetting.cpu()[owner] * self._basis).sum(-1, keepdim=True).exp()
+
+    def move(self, device: torch.device) -> None:
+        """To where the field is that is judged."""
+        if self.rays is not None:
+            self.rays = Rays(self.rays.origins.to(device), self.rays.directions.to(device))
+            self.truth, self.owner, self.left = (t.to(device) for t in (self.truth, self.owner, self.left))
 
     def psnr(self, model: Field, exposed: bool = False) -> float:
         """dB over the pixels; NaN if there are none. ``exposed``: the photos' exposures are not known: each one's is

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -16,6 +17,22 @@ from refield.scene.images import frame_image
 DIRECTIONS_MOST = 1 << 29  # bytes; camera-space directions are kept for every pixel of every distinct camera up to here
 
 _TABLE_MOST = 64  # directions in the tables for each pixel of the bank
+
+
+class Pixels(Protocol):
+    """P pixels of F photos, wherever they are kept; see `PixelBank`."""
+
+    frames: tuple[Frame, ...]
+    starts: Tensor
+    """(F + 1,) int64: frame i owns pixels ``starts[i] : starts[i + 1]``"""
+
+    def __len__(self) -> int: ...
+    def frame_of(self, pixels: Tensor) -> Tensor: ...
+    def place_of(self, pixels: Tensor) -> Tensor: ...
+    def rays(self, pixels: Tensor) -> Rays: ...
+    def camera_directions(self, pixels: Tensor, owner: Tensor) -> Tensor: ...
+    def vignetting_basis(self, pixels: Tensor, owner: Tensor) -> Tensor: ...
+    def colours(self, pixels: Tensor) -> Tensor: ...
 
 
 class PixelBank:

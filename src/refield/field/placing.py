@@ -47,6 +47,7 @@ def new_field(capture: Capture, config: FitConfig, seed: int, core: Contraction 
 def opened(start: HashField) -> HashField:
     """A copy of a field that looks everywhere, its weights free: things may have come to where nothing was."""
     model = HashField.from_state(*start.state()).requires_grad_(True)
+    model.sampler = replace(model.sampler, per_step=1.0)
     model.looking_where(torch.ones_like(model.sampler.grid))
     return model
 

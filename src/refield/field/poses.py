@@ -37,7 +37,7 @@ class PoseFit:
         self.frames = tuple(frames)
         self._cameras = list(dict.fromkeys(f.camera for f in frames))
         self.camera_of = torch.tensor([self._cameras.index(f.camera) for f in frames])
-        self._given = torch.stack([f.world_from_cam for f in frames])
+        self._given = torch.stack([f.world_from_cam for f in frames]).to(self.camera_of.device)
         focal = torch.tensor([f.camera.fx for f in frames])
         size = torch.tensor([math.hypot(c.width, c.height) / 2 for c in self._cameras])
         # one unit of each parameter moves a pixel by one
@@ -52,12 +52,13 @@ class PoseFit:
         self._photos = torch.bincount(self.camera_of)
         self._shared = (self._photos >= _SHARED)[:, None]
         self._common = self._in_common()
-        self._pose()
+        self._now = self._given.clone()
+        self.rotations, self.centres = self._now[:, :3, :3].float(), self._now[:, :3, 3].float()
 
     def rays(self, owner: Tensor, camera_directions: Tensor) -> Rays:
         """World rays of photos (N,) along unit directions (N, 3) in camera axes, as given lenses have them."""
         d = camera_directions
-        if bool(self.lens.any()):
+        if d.device.type != "cpu" or bool(self.lens.any()):  # a GPU is not asked
             d = self._bent(owner, d)
         world = (self.rotations[owner] @ d[:, :, None])[:, :, 0]
         return Rays(self.centres[owner], world)
@@ -130,18 +131,15 @@ class PoseFit:
     def _pose(self) -> None:
         change = (self.moved * self._unit).double()
         turns = exp(torch.cat([torch.zeros_like(change[:, 3:]), change[:, :3]], -1))[:, :3, :3]
-        rotations = turns @ self._given[:, :3, :3]
-        self._now = self._given.clone()
-        self._now[:, :3, :3] = rotations
-        self._now[:, :3, 3] += change[:, 3:]
-        self.rotations, self.centres = rotations.float(), self._now[:, :3, 3].float()
+        self._now[:, :3, :3] = turns @ self._given[:, :3, :3]
+        self._now[:, :3, 3] = self._given[:, :3, 3] + change[:, 3:]
+        self.rotations.copy_(self._now[:, :3, :3])
+        self.centres.copy_(self._now[:, :3, 3])
 
     def found(self) -> tuple[Frame, ...]:
         """The frames where they were taken, with their lenses."""
-        lenses = self.lenses()
-        return tuple(
-            replace(f, world_from_cam=pose, camera=lenses[f.camera]) for f, pose in zip(self.frames, self._now)
-        )
+        lenses, poses = self.lenses(), self._now.clone().cpu()
+        return tuple(replace(f, world_from_cam=pose, camera=lenses[f.camera]) for f, pose in zip(self.frames, poses))
 
     def lenses(self) -> dict[Camera, Camera]:
         """Of each camera as given, as it is now."""

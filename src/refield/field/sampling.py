@@ -17,6 +17,7 @@ from refield.field.volrend import Samples
 from refield.scene.capture import Rays
 
 RESOLUTION = 128  # cells a side of the occupancy grid
+IN_PICTURES = 1.5  # samples a step
 STOP = 7.0  # optical depth at which a ray ends: e^-7 is a thousandth
 
 
@@ -36,6 +37,8 @@ class OccupancySampler:
     fine: Tensor | None = None
     """(R, R, R) int64: which parts of occupied cells may hold something, see `kernels.masks.marked`; 0, or None for all
     of them, where nothing so fine is known. Whoever lets something new into a cell has to set its mask to 0."""
+    per_step: float = 1.0
+    """samples a step; a step is as long as surfaces are thick"""
 
     @property
     def resolution(self) -> int:
@@ -81,8 +84,13 @@ class OccupancySampler:
 
     @property
     def lattice(self) -> Lattice:
-        """near, far and step, world units."""
-        return self.near, self.far * self.contraction.radius, self.step
+        """near, far and length of a sample in the core, world units."""
+        return self.near, self.far * self.contraction.radius, self.step / self.per_step
+
+    def for_pictures(self) -> OccupancySampler:
+        """The same with shorter samples. Where a fit's samples lie is drawn anew for each ray, and what it learns is
+        right for their mean; a picture with one of a ray's draws has the noise of that (see docs/results.md)."""
+        return replace(self, per_step=IN_PICTURES)
 
     def cells(self, x: Tensor) -> Tensor:
         """Flat index of the grid cell that holds each world point, (..., 3) -> (...,) int64."""
@@ -102,7 +110,7 @@ class OccupancySampler:
         return marked(places, self.grid, self.fine).reshape(x.shape[:-1])
 
     def step_at(self, cells: Tensor) -> Tensor:
-        """Length of a sample in the given cells (K,), world units (K,)."""
+        """Length of a step in the given cells (K,), world units (K,)."""
         return self.step * self.distance(cells).clamp_min(1.0) ** 1.5
 
     def distance(self, cells: Tensor) -> Tensor:
@@ -134,7 +142,7 @@ class OccupancySampler:
     ) -> OccupancySampler:
         """The same sampler with the cells that touch the world boxes (2, 3) looked up anew in ``density``.
 
-        A cell is occupied if at one of ``probes`` points a sample would have an opacity above ``threshold``: of many,
+        A cell is occupied if at one of ``probes`` points a step would have an opacity above ``threshold``: of many,
         since a moved surface crosses cells at any angle. They are always the same. Of the cells' parts nothing is known
         any more.
         """

@@ -35,7 +35,7 @@ def state_of(field: nn.Module, config: DataclassInstance, sampler: OccupancySamp
         "architecture": type(field).__name__,
         "config": asdict(config),
         "contraction": {"centre": space.centre.tolist(), "radius": space.radius},
-        "sampler": {"step": sampler.step, "near": sampler.near, "far": sampler.far},
+        "sampler": {k: getattr(sampler, k) for k in ("step", "near", "far", "per_step")},
     }
     return tensors, facts
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from refield.field.pixels import PixelBank
+from refield.field.pixels import Pixels
 
 _SIDE = 24  # patches along a photo's longer side
 _OUTLYING = 3.0  # robust standard deviations
@@ -28,7 +28,7 @@ _AROUND = ((0.25, 0.5, 0.25), (0.5, 1.0, 0.5), (0.25, 0.5, 0.25))  # what a patc
 class PhotoTrust:
     """Running means of squared errors, and what follows from them for the next step's rays."""
 
-    def __init__(self, bank: PixelBank, places: int) -> None:
+    def __init__(self, bank: Pixels, places: int) -> None:
         """``places``: where rays may end."""
         sizes = torch.tensor([(f.camera.width, f.camera.height) for f in bank.frames])
         patch = sizes.amax(-1).div(_SIDE, rounding_mode="floor").clamp_min(1)
@@ -50,13 +50,13 @@ class PhotoTrust:
 
     def learn(self, patches: Tensor, place: Tensor, errors: Tensor) -> None:
         """Note the errors (N, 3) of rays in their patches (N,), and at the places where they end (N,); -1: nowhere."""
-        ends = place >= 0
-        patches, place, error = patches[ends], place[ends], errors[ends].square().mean(-1)
+        ends = (place >= 0).float()
+        place, error = place.clamp_min(0), errors.square().mean(-1)
         known = self._places[place]
         expected = known[:, 1] / known[:, 0].clamp_min(1)
-        told = (known[:, 0] >= _SEEN).float()
+        told = ends * (known[:, 0] >= _SEEN)
         ones = torch.ones_like(error)
-        self._places.index_add_(0, place, torch.stack([ones, error], -1))
+        self._places.index_add_(0, place, torch.stack([ones, error], -1) * ends[:, None])
         noted = torch.stack([ones, error, expected], -1) * told[:, None]
         self._patches.view(-1, 3).index_add_(0, patches, noted)
         self._steps += 1
@@ -73,6 +73,6 @@ class PhotoTrust:
             middle = ratio[known].median()
             deviation = 1.4826 * (ratio[known] - middle).abs().median()
             over = (ratio - middle) / (_OUTLYING * deviation).clamp_min(1e-6)
-            self.trust = torch.where(known & (over > 1), over.clamp_min(1) ** -4, torch.ones_like(over))
+            self.trust.copy_(torch.where(known & (over > 1), over.clamp_min(1) ** -4, 1.0))
         self._patches *= _FADE
         self._places *= _FADE

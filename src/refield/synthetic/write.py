@@ -24,6 +24,7 @@ from refield.scene.errors import InputError, did_you_mean
 from refield.scene.images import write_image
 from refield.scene.transforms_json import save_transforms
 from refield.synthetic.cameras import hemisphere, ring, square_camera
+from refield.synthetic.grounds import Ground, on_ground
 from refield.synthetic.pathtrace import PathTracer
 from refield.synthetic.state import Item, State, TrueChange, World
 from refield.synthetic.visibility import view_hits
@@ -53,6 +54,8 @@ class SynthConfig:
     """family of the cameras' path in the world random; if not given, as its seed says"""
     mixed: bool = False
     """portrait and landscape photos in the world random, whatever its seed says"""
+    ground: Ground = "flat"
+    """what objects stand on in a world with a name, where they all stand on its floor"""
     seed: int = 0
     """of textures, surroundings and the paths; of everything in the world random"""
 
@@ -70,20 +73,22 @@ def write_world(
     size: int = 128,
     spp: int = 64,
     cameras: int | None = None,
+    ground: Ground = "flat",
     seed: int = 0,
     on_progress: Progress | None = None,
 ) -> World:
     """Render the world called ``name`` into the folder ``out``; for the world random see `random_write`.
 
     Raises:
-        InputError: there is no such world, a number is out of range, or Mitsuba is not installed.
+        InputError: there is no such world, it cannot have this ground, a number is out of range, or Mitsuba is not
+            installed.
     """
     if name not in WORLDS:
         near = did_you_mean(name, ["random", *WORLDS])
         raise InputError(
             f"world {name!r}", "there is no such world", f"{near}choose one of random, {', '.join(WORLDS)}"
         )
-    world = WORLDS[name](seed)
+    world = on_ground(WORLDS[name](seed), ground, seed)
     photograph(world, out, SynthConfig(size, spp, cameras, seed=seed), on_progress)
     return world
 

@@ -2,8 +2,9 @@
 
 Each pixel is a linear equation in four texels, so nothing has to be learnt and one photo is enough; where there are
 several, they also say how far the plane is off. Where none shows the ground, its gradients are the old field's (Pérez
-et al. 2003, Poisson image editing): the old texture goes on in the light that there is beside it. Texels on which the
-photos do not agree are not known: there is no such plane there, or something stands on it. They are the helper's.
+et al. 2003, Poisson image editing): the old texture goes on in the light that there is beside it. Where nothing ever
+showed it, its own pattern does (`pattern.continued`). Texels on which the photos do not agree are not known: there is
+no such plane there, or something stands on it. They are the helper's.
 
 Letters: (U, V) texels, N pixels.
 """
@@ -32,8 +33,9 @@ from refield.scene.change import OccupancyGrid
 from refield.scene.planes import Plane
 from refield.update.composite import UpdatedField
 from refield.update.cut import Known
-from refield.update.ground import Foothold
+from refield.update.ground import Foothold, GroundConfig
 from refield.update.helper import step_near
+from refield.update.pattern import continued
 from refield.update.region import Region
 from refield.update.supervision import Lessons
 from refield.update.texture import Guide, fitted
@@ -53,15 +55,16 @@ _GRAZING = 0.1  # sine of the angle at which a ray is taken to meet a plane at l
 
 
 def textured_of(
-    known: Known, ground: Sequence[Foothold], dark: OccupancySampler, reach: float, pixel: float
+    known: Known, ground: Sequence[Foothold], dark: OccupancySampler, config: GroundConfig, pixel: float
 ) -> tuple[TexturedPlane, ...]:
     """The texture of the ground that objects stood on, and of what is beside these places and the new ones, within
-    ``reach`` times the objects' boxes; the rest as of `textured_planes`."""
+    the config's reach; the rest as of `textured_planes`."""
     cut = known.cut
     places = [o.grid for o in cut.to_learn.objects] + [m.grid.moved(m.new_from_old) for m in cut.moves]
-    around = Region(tuple(g.dilated(reach) for g in places) + cut.earlier.unknown.grids)
+    around = Region(tuple(g.dilated(config.reach) for g in places) + cut.earlier.unknown.grids)
     arrived = tuple(g for o in cut.change.objects if (g := o.grid_now) is not None)
-    return textured_planes(ground, around, cut, dark, Region(arrived + cut.bare.grids), known.sparse.taught, pixel)
+    unsure, taught = Region(arrived + cut.bare.grids), known.sparse.taught
+    return textured_planes(ground, around, cut, dark, unsure, taught, pixel, patterned=config.patterned)
 
 
 def textured_planes(
@@ -72,6 +75,8 @@ def textured_planes(
     unsure: Region,
     new: Lessons,
     pixel: float,
+    *,
+    patterned: bool = True,
 ) -> tuple[TexturedPlane, ...]:
     """The planes of ``ground`` with what the photos show of them, in the region ``around``.
 
@@ -81,10 +86,11 @@ def textured_planes(
         unsure: where something stands now; what a ray through it shows is not the ground.
         new: pixels of the new photos.
         pixel: side of a new photo's pixel there, world units.
+        patterned: they go on where no photo shows them; else they end there.
     """
     planes = {id(f.plane): f.plane for f in ground}.values()
     found = [
-        _textured([f for f in ground if f.plane is p], p, place, cut, dark, unsure, new, pixel)
+        _textured([f for f in ground if f.plane is p], p, place, cut, dark, unsure, new, pixel, patterned)
         for p in planes
         for place in _apart(around)
     ]
@@ -111,6 +117,7 @@ def _textured(
     unsure: Region,
     new: Lessons,
     pixel: float,
+    patterned: bool,
 ) -> TexturedPlane | None:
     blank = _blank(plane, around, cut, pixel)
     shape = tuple(blank.known.shape)
@@ -122,26 +129,37 @@ def _textured(
     on, guide = _shown(cut.pretrained, blank, nodes)
     on &= ~dark.occupied(nodes + blank.clear * blank.normal)
     inside, under, beside = (m.reshape(shape) for m in (inside, inside & under, inside & on & ~under))
-    seen = new[replace(blank, known=inside).hit(new.rays).nonzero()[:, 0]]
-    t = blank.met(seen.rays)
-    steep = -(seen.rays.directions @ blank.normal).clamp(max=-_GRAZING)
-    hidden, rgb = _in_front(cut, seen.rays, t - _ON * blank.clear / steep)
+    new = new[replace(blank, known=inside).hit(new.rays).nonzero()[:, 0]]
+    t = blank.met(new.rays)
+    steep = -(new.rays.directions @ blank.normal).clamp(max=-_GRAZING)
+    before, rgb = _in_front(cut, new.rays, t - _ON * blank.clear / steep)
     for grid in unsure.grids:
-        hidden[grid.met_by(seen.rays)] = 1.0
-    x = seen.rays.origins + t[:, None] * seen.rays.directions
-    free = hidden < _CLEAR
+        before[grid.met_by(new.rays)] = 1.0
+    x = new.rays.origins + t[:, None] * new.rays.directions
+    free = before < _CLEAR
     # a plain piece of ground may have no surface in the old field; rays that come to it freely say that it is there
     whole = torch.from_numpy(ndimage.binary_fill_holes((beside | under).numpy()))
     under |= whole & inside & ~beside & torch.from_numpy(_among(blank.texels(x[free]).numpy(), shape))
     used = (free & blank.over(beside | under, x)).nonzero()[:, 0]
     if len(used) < _FEWEST:
         return None
-    colours = ((seen.rgb - rgb) / (1 - hidden)[:, None])[used]
+    colours = ((new.rgb - rgb) / (1 - before)[:, None])[used]
     told = colours.double().numpy()
-    found, places = fitted(blank, seen.rays[used], told, Guide(guide.double().numpy(), beside.numpy()))
-    known = beside.numpy() | (under.numpy() & _among(places, shape))
-    known &= ~_disputed(places, told, seen.photo[used].numpy(), shape)
-    return replace(found, known=torch.from_numpy(known)) if known.any() else None
+    found, places = fitted(blank, new.rays[used], told, Guide(guide.double().numpy(), beside.numpy()))
+    seen = beside.numpy() | (under.numpy() & _among(places, shape))
+    seen &= ~(disputed := _disputed(places, told, new.photo[used].numpy(), shape))
+    if not seen.any():
+        return None
+    found = replace(found, known=torch.from_numpy(seen))
+    # what hides the ground from all photos leaves a helper nothing to learn from
+    hidden = under.numpy() & ndimage.binary_fill_holes(seen) & ~seen & ~disputed
+    return _gone_on(found, hidden) if patterned and hidden.any() else found
+
+
+def _gone_on(plane: TexturedPlane, hidden: Array) -> TexturedPlane:
+    """The plane with its texture, and that of what is around, where nobody saw it: in texels (U, V) bool."""
+    rgb = continued(plane.rgb.double().numpy(), plane.known.numpy(), hidden)
+    return replace(plane, rgb=torch.from_numpy(rgb).float(), known=plane.known | torch.from_numpy(hidden))
 
 
 def _blank(plane: Plane, around: Region, field: Field, pixel: float) -> TexturedPlane:

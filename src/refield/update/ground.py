@@ -35,6 +35,8 @@ class GroundConfig:
     """nothing is beyond the planes that objects stood on or leant against, and haze over them is dear"""
     textured: bool = True
     """these planes get the texture that the new photos show, by least squares; else the helper learns them"""
+    patterned: bool = True
+    """where no photo shows these planes they go on as around there, in their own pattern; else that is the helper's"""
     reach: float = 2.0
     """within each object's grid at its old and its new place, its box this many times as large (the paper: 2 to 3).
     When the object moves on, what lies within `composite.DILATION` times its box is forgotten."""

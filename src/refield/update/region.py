@@ -89,7 +89,7 @@ def finer(sampler: OccupancySampler) -> OccupancySampler:
 
     A surface is as thick as a sample is long, and in a thick one each of a few photos may have a layer of its own.
     """
-    return replace(sampler, step=_FINER * sampler.step)
+    return replace(sampler, step=_FINER * sampler.step, per_step=1.0)
 
 
 def forgotten(planes: Sequence[TexturedPlane], places: Region, but: Region) -> tuple[TexturedPlane, ...]:

@@ -93,7 +93,7 @@ def update_field(
         sight_of(cut.pretrained, capture.train, wide.around) if config.freeze.unseen else nothing_seen(cut.pretrained)
     )
     textured = ground if config.ground.textured else []
-    planes = textured_of(known, textured, sight.dark, config.ground.reach, pixel)
+    planes = textured_of(known, textured, sight.dark, config.ground, pixel)
     say("freeze")
     told, region = Region(wide.grids, planes), finer(without_planes(near, planes))
     frozen = cut.but(learnt=replace(lit, region=told)).unshown(sight.hidden)

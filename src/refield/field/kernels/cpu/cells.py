@@ -14,26 +14,45 @@ from refield.field.kernels.cpu.encoding import array
 from refield.field.kernels.cpu.simd import JIT
 from refield.field.kernels.masks import ASKED, ASKED_NOW, FADING, SHOWN, SHOWN_NOW
 
-BLOCKS, _FAR = 4, 8  # cells a side that are skipped together; the furthest that is looked for, in blocks
+_BLOCK, _FAR = 4, 8  # cells a side of a block; the furthest that is looked for, in blocks
+_AROUND = _BLOCK + 1  # the furthest that is looked for, in cells: where something is in a neighbour's block
 _NO_MASKS = np.zeros((0, 0, 0), np.int64)
 _ONE_BIT = np.int64(1)
+_BIT, _LAST = np.uint64(1), np.uint64(63)
 
 
 def _reach(grid: np.ndarray) -> np.ndarray:
-    """Per block of BLOCKS^3 cells: chessboard distance to the next with something in it, in blocks, at most _FAR."""
-    side = -(-grid.shape[0] // BLOCKS)
-    full = np.ascontiguousarray(np.pad(grid, (0, side * BLOCKS - grid.shape[0])))
-    rows = full.view(np.uint32) != 0  # BLOCKS cells of one byte
-    near = rows.reshape(side, BLOCKS, side, BLOCKS, side).any((1, 3)).astype(np.uint8)
-    out = np.zeros_like(near)
-    for _ in range(_FAR):
-        out += 1 - near
-        for axis in range(3):
-            here = np.moveaxis(near, axis, 0)
-            wide = here.copy()
-            np.maximum(wide[1:], here[:-1], out=wide[1:])
-            np.maximum(wide[:-1], here[1:], out=wide[:-1])
-            near = np.moveaxis(wide, 0, axis)
+    """Per cell: 0 where something is, else a chessboard distance in cells within which nothing is.
+
+    The distance itself up to _AROUND; further off by how many blocks of cells are empty around its own.
+    """
+    r = grid.shape[0]
+    side = -(-r // _BLOCK)
+    full = np.ascontiguousarray(np.pad(grid, (0, side * _BLOCK - r)))
+    rows = full.view(np.uint32) != 0  # _BLOCK cells of one byte
+    blocks = _distances(rows.reshape(side, _BLOCK, side, _BLOCK, side).any((1, 3)).astype(np.uint8), _FAR)
+    far = np.where(blocks > 1, (blocks - 1) * np.uint8(_BLOCK) + np.uint8(1), 0).astype(np.uint8)
+    for axis in range(3):
+        far = far.repeat(_BLOCK, axis)
+    return np.maximum(_distances((grid > 0).view(np.uint8), _AROUND), far[:r, :r, :r])
+
+
+def _distances(full: np.ndarray, most: int) -> np.ndarray:
+    """Chessboard distance to the next that is 1, of 0 and 1 on a lattice (R, R, R), at most ``most``."""
+    r, out = full.shape[-1], 1 - full
+    # 64 along the last axis at once
+    near = np.packbits(np.pad(full, ((0, 0), (0, 0), (0, -r % 64))), axis=-1, bitorder="little").view(np.uint64)
+    for _ in range(most - 1):
+        wide = near | near << _BIT | near >> _BIT
+        wide[..., 1:] |= near[..., :-1] >> _LAST
+        wide[..., :-1] |= near[..., 1:] << _LAST
+        for axis in range(2):
+            here, wide = wide, wide.copy()
+            there, onto = np.moveaxis(here, axis, 0), np.moveaxis(wide, axis, 0)
+            onto[1:] |= there[:-1]
+            onto[:-1] |= there[1:]
+        near = wide
+        out += 1 - np.unpackbits(near.view(np.uint8), axis=-1, count=r, bitorder="little")
     return out
 
 
@@ -41,7 +60,10 @@ _reaches: list[tuple[Any, int, np.ndarray]] = []
 
 
 def reach(grid: Tensor) -> np.ndarray:
-    """How far rays may go without a look at the grid; kept while the grid lives and is not written to."""
+    """How far it is from each cell to the next that may hold something, in cells, (R, R, R); never more than it is.
+
+    Kept while the grid lives and is not written to.
+    """
     if grid.is_inference():  # does not say when it is written to
         return _reach(array(grid))
     for known, version, found in _reaches:
@@ -52,9 +74,9 @@ def reach(grid: Tensor) -> np.ndarray:
     return found
 
 
-def grids_of(grid: Tensor, fine: Tensor | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the walk looks at: cells, how far it may go without a look at them, and their sub-cells if known."""
-    return array(grid), reach(grid), _NO_MASKS if fine is None else array(fine)
+def grids_of(grid: Tensor, fine: Tensor | None) -> tuple[np.ndarray, np.ndarray]:
+    """What the walk looks at: how far it may go without another look, see :func:`reach`, and sub-cells if known."""
+    return reach(grid), _NO_MASKS if fine is None else array(fine)
 
 
 # --- parts of cells --------------------------------------------------------------------------------------------------

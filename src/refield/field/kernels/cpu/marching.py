@@ -15,6 +15,7 @@ from torch import Tensor
 
 from refield.field.kernels.cpu.cells import grids_of
 from refield.field.kernels.cpu.encoding import array, encode_part, pairs, parts_of, scratch
+from refield.field.kernels.cpu.lanes import new_lanes, next_samples
 from refield.field.kernels.cpu.networks import padded
 from refield.field.kernels.cpu.simd import JIT, exp, product
 from refield.field.kernels.cpu.walk import next_sample, start
@@ -113,13 +114,6 @@ def _raw_density(features, first, n, sizes, w_in, w_out, x, hidden, raw):  # typ
         raw[s] = total
 
 
-@njit(forceinline=True, **JIT)
-def _inside(unit, grid):  # type: ignore[no-untyped-def]
-    r = grid.shape[0]
-    i, j, k = int(unit[0] * r), int(unit[1] * r), int(unit[2] * r)
-    return grid[min(max(i, 0), r - 1), min(max(j, 0), r - 1), min(max(k, 0), r - 1)] > 0
-
-
 @njit(**JIT)
 def _wave_part(begin, end, rays, space, grids, lattice, net, way, arena):  # type: ignore[no-untyped-def]
     """March rays ``begin : end``; the samples, wave by wave, into ``arena``. Returns how many, or -1 without room.
@@ -132,7 +126,7 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, way, arena):  # typ
     n, step = end - begin, np.float32(lattice[2])
     lines, t, tau = np.empty((n, 11), np.float32), np.empty(n, np.float32), np.zeros(n, np.float32)
     far = np.full(n, np.float32(lattice[1]))
-    alive = np.arange(n)
+    alive, lanes = np.arange(n), new_lanes()
     x, hidden = np.zeros((_BLOCK, features.shape[1]), np.float32), np.empty((_BLOCK, w_in.shape[1]), np.float32)
     raw = np.empty(_BLOCK, np.float32)
     pair_features = features.view(np.float64)
@@ -144,17 +138,8 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, way, arena):  # typ
     while living > 0:
         if total + living > len(t0):
             return -1
-        m = 0
-        for a in range(living):
-            r = alive[a]
-            t[r], dt = next_sample(lines[r], t[r], far[r], step, grids, unit[total + m])
-            while dt > 0 and len(gone) > 0 and _inside(unit[total + m], gone):
-                t[r], dt = next_sample(lines[r], t[r] + dt, far[r], step, grids, unit[total + m])
-            if dt > 0:
-                t0[total + m], t1[total + m], owner[total + m] = t[r], t[r] + dt, begin + r
-                t[r] += dt
-                alive[m] = r
-                m += 1
+        out = (t0[total:], t1[total:], owner[total:], unit[total:])
+        m = next_samples(alive[:living], lines, t, far, step, grids, gone, lanes, out)
         encode_part(unit, total, total + m, tables, resolutions, pair_features)
         living = 0
         for first in range(0, m, _BLOCK):
@@ -163,6 +148,7 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, way, arena):  # typ
             for a in range(some):
                 r, i = alive[first + a], total + first + a
                 tau[r] += exp(min(raw[a], np.float32(15))) / space[1] * (t1[i] - t0[i])
+                owner[i] = begin + r
                 if tau[r] < stop:
                     alive[living] = r
                     living += 1

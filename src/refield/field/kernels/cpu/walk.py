@@ -7,12 +7,11 @@ import math
 import numpy as np
 from numba import njit
 
-from refield.field.kernels.cpu.cells import BLOCKS
 from refield.field.kernels.cpu.simd import JIT
 
 _ZERO, _ONE, _TWO, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
 _FINE = np.float32(4)  # sub-cells a side of a cell
-_BLOCK_FINE = 4 * BLOCKS  # sub-cells a side of a block that is skipped
+STRETCH = np.float32(0.75)  # the contraction lengthens nothing by more than 4/3
 
 
 @njit(forceinline=True, **JIT)
@@ -29,8 +28,8 @@ def next_sample(ray, t, far, step, grids, unit):  # type: ignore[no-untyped-def]
 
     ``ray``: see :func:`start`; ``grids``: see `cells.grids_of`. ``unit`` (3,) is set to the midpoint in [0, 1].
     """
-    grid, reaches, fine = grids
-    r = grid.shape[0]
+    near, fine = grids
+    r = near.shape[0]
     last = 4 * r - 1
     per_unit, quarter, half = np.float32(r / 4), np.float32(0.25), step * _HALF
     u0, u1, u2, v0, v1, v2 = ray[0], ray[1], ray[2], ray[3], ray[4], ray[5]
@@ -54,14 +53,14 @@ def next_sample(ray, t, far, step, grids, unit):  # type: ignore[no-untyped-def]
             min(max(int(q * _FINE), 0), last),
             min(max(int(o * _FINE), 0), last),
         )
-        empty = reaches[i // _BLOCK_FINE, j // _BLOCK_FINE, l // _BLOCK_FINE]
-        size, many = (np.float32(BLOCKS), np.float32(empty)) if empty > 0 else (_ONE, _ONE)
-        if empty == 0 and grid[i >> 2, j >> 2, l >> 2] > 0:
+        empty = near[i >> 2, j >> 2, l >> 2]
+        size, many = _ONE, np.float32(empty)
+        if empty == 0:
             mask = fine[i >> 2, j >> 2, l >> 2] if len(fine) > 0 else 0
             if mask == 0 or (mask >> (((i & 3) * 4 + (j & 3)) * 4 + (l & 3))) & 1:
                 unit[0], unit[1], unit[2] = a * quarter, b * quarter, c * quarter
                 return t, dt
-            size = quarter
+            size, many = quarter, _ONE
         if m < _ONE:
             # lattice midpoints in what is empty are skipped; a hair is kept back for rounding
             leave = min(
@@ -72,9 +71,8 @@ def next_sample(ray, t, far, step, grids, unit):  # type: ignore[no-untyped-def]
             if skip > 0:
                 t += step * skip
         elif empty > 1:
-            # outside the core the lattice has to be walked, but without a look at the grid; the contraction lengthens
-            # nothing by more than 4/3
-            safe = min(t + np.float32(empty - 1) * np.float32(0.75 * BLOCKS) / per_unit * ray[9], far)
+            # outside the core the lattice has to be walked, but without a look at the grid
+            safe = min(t + np.float32(empty - 1) * STRETCH / per_unit * ray[9], far)
             t += dt
             while t < safe:
                 m = max(abs(u0 + v0 * t), max(abs(u1 + v1 * t), abs(u2 + v2 * t)))

@@ -68,9 +68,19 @@ def train_step(
     cells = (ijk[:, 0] * side + ijk[:, 1]) * side + ijk[:, 2]
     w, sigmas, loss = w.detach(), sigmas.detach(), loss.detach()
     to_rays = (grads[-2][: batch.moving], grads[-1][: batch.moving]) if batch.moving else None
-    told = None, shown[:, :3].detach(), errors.detach(), None, to_rays
+    real = torch.arange(len(w), device=w.device) < offsets[-1]
+    told = None, shown[:, :3].detach(), errors.detach(), heaviest(w, ids, real, whole > 0), to_rays
     if capacity is None:
         return Stepped(float(loss), cells, w, sigmas, len(offsets) - 1, *told)
-    real = torch.arange(capacity, device=w.device) < offsets[-1]
     w, sigmas = torch.where(real, w, -1.0), torch.where(real, sigmas, -1.0)
     return Stepped(loss, cells, w, sigmas, len(offsets) - 1, *told)  # type: ignore[arg-type]
+
+
+def heaviest(w: Tensor, ids: Tensor, real: Tensor, whole: Tensor) -> Tensor:
+    """See `reference.heaviest`: of weights (S,) of rays ``ids`` (S,), those that are ``real``; of rays that are not
+    ``whole`` (N,), for want of room, none."""
+    none = len(w)
+    most = w.new_zeros(len(whole)).scatter_reduce_(0, ids, torch.where(real, w, 0.0), "amax")
+    rows = torch.where(real & (w == most[ids]), torch.arange(none, device=w.device), none)
+    first = torch.full_like(whole, none, dtype=torch.long).scatter_reduce_(0, ids, rows, "amin")
+    return torch.where(whole & (first < none), first, -1)

@@ -1,0 +1,93 @@
+"""What a hypothesis of what changed leaves unexplained in the new photos: one number, to compare hypotheses by.
+
+Each pixel is asked how far its photo is from the picture that the hypothesis makes, beside what counts as a change
+there. Beyond that it only says that something is wrong, and costs 1. What may show anything, since something came or
+nobody knows what is behind, costs less than what is wrong, and more than what is right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from refield.estimate.alone import object_alone
+from refield.estimate.arrive import shadow_of
+from refield.estimate.detect import blur_sigma
+from refield.estimate.explain import LIMIT, Compared, relit
+from refield.estimate.ground import Ground
+from refield.estimate.lattice import Voxels
+from refield.estimate.look import Array
+from refield.estimate.objects import Old
+from refield.estimate.past import Past
+from refield.estimate.pose_change import SIDE, PoseChange
+from refield.scene.pose import invert, transform
+from refield.vision import pixels
+
+_NUMBERS = 6
+"""of a pose; two cost as much as the fewest pixels that a body must fill in a photo to be told"""
+_CAME, _UNKNOWN = 0.7, 0.4
+"""what a pixel costs that may show anything, since something came there, or since nobody had seen what is behind"""
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What became of everything that changed."""
+
+    moved: dict[int, PoseChange] = field(default_factory=dict)
+    """by index of the old object"""
+    removed: dict[int, float] = field(default_factory=dict)
+    """by index of the old object: part of its pixels that show what was behind"""
+    arrived: tuple[Voxels, ...] = ()
+    views: tuple[Past, ...] = ()
+    olds: tuple[Old, ...] = ()
+    """the old objects, those that were found again without what cannot be theirs"""
+    touched: tuple[int, ...] = ()
+    """indices of those that may have moved or left"""
+
+
+def unexplained_by(ground: Ground, settled: Settled) -> float:
+    """Pixels, over all new photos, that a hypothesis does not explain; and for each body the fewest that one must fill
+    in a photo to be told."""
+    pose = _NUMBERS / 2 * ground.believe.smallest * float(np.mean([p.view.depth.size for p in settled.views] or [0]))
+    return len(settled.moved) * pose + sum(float(_left(ground, settled, p).sum()) for p in settled.views)
+
+
+def _left(ground: Ground, settled: Settled, p: Past) -> Array:
+    """(H, W) in [0, 1], what is left unexplained of each pixel of a photo."""
+    picture, anything, came = p.rgb, p.was & ~p.known, np.zeros(p.view.shape, bool)
+    depth, moved = p.beyond, np.zeros(p.view.shape, bool)
+    for k, change in settled.moved.items():
+        picture, depth, shown, bare = _before(ground, settled.olds[k], change, p, picture, depth)
+        anything, moved = (anything & ~shown) | bare, moved | shown
+    for part in settled.arrived:
+        came |= shadow_of(p.view, ground.hull.lattice, part)
+    sigma = blur_sigma(p.view, ground.detect)
+    apart = pixels.colour_difference(pixels.blur(p.view.photo, sigma), pixels.blur(picture, sigma), ground.detect.reach)
+    wrong = LIMIT * p.changed.threshold * np.where(moved, LIMIT, 1)  # never seen in this light, nor by these cameras
+    left = np.minimum((apart / wrong) ** 2, 1)
+    left = np.where(p.changed.new | (p.changed.light & ~p.was), 0, left)
+    return np.asarray(np.where(came, _CAME, np.where(anything, _UNKNOWN, left)), np.float32)
+
+
+def _before(
+    ground: Ground, old: Old, change: PoseChange, p: Past, picture: Array, depth: Array
+) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """The picture (H, W, 3) and its depth with a moved object in it, in the light in which the photo shows it; the
+    pixels that show it, and those of them that show what no old photo saw of it."""
+    view, pose = p.view, change.new_from_old
+    alone = object_alone(ground.field, old, view.rays, pose)
+    own, alpha, at = (t.reshape(*view.shape, -1).numpy() for t in (alone.rgb, alone.opacity, alone.depth))
+    front = at[..., 0] <= depth + 2 * view.pixel_angle * np.where(np.isfinite(depth), depth, 0)
+    alpha = np.where(front, alpha[..., 0], 0)
+    shown = alpha > 0.5
+    made = np.where(front[..., None], own + (1 - alpha[..., None]) * picture, picture).astype(np.float32)
+    sides = np.full(view.shape, -1)
+    x = view.centre + view.directions[shown] * at[shown]
+    sides[shown] = old.side_of(transform(invert(pose), torch.from_numpy(x)).numpy())
+    known = Compared(view.photo, made, view.rgb, p.changed.threshold, sides)
+    away = float(np.linalg.norm(transform(pose, torch.from_numpy(old.centre).double()).numpy() - view.centre))
+    made = relit(known, SIDE * old.radius / (away * view.pixel_angle))
+    return made, np.where(shown, at[..., 0], depth), shown, shown & (sides < 0)
