@@ -26,8 +26,8 @@ from refield.estimate.pose_change import SIDE, PoseChange
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
-_NUMBERS = 6
-"""of a pose; two cost as much as the fewest pixels that a body must fill in a photo to be told"""
+_POSE = 3.0
+"""what a pose costs, in the fewest pixels that a thing must fill in a photo: for two of its six numbers as much"""
 _CAME, _UNKNOWN = 0.7, 0.4
 """what a pixel costs that may show anything, since something came there, or since nobody had seen what is behind"""
 
@@ -49,9 +49,8 @@ class Settled:
 
 
 def unexplained_by(ground: Ground, settled: Settled) -> float:
-    """Pixels, over all new photos, that a hypothesis does not explain; and for each body the fewest that one must fill
-    in a photo to be told."""
-    pose = _NUMBERS / 2 * ground.believe.smallest * float(np.mean([p.view.depth.size for p in settled.views] or [0]))
+    """Pixels, over all new photos, that a hypothesis does not explain, and what its poses cost."""
+    pose = _POSE * ground.believe.smallest * float(np.mean([p.view.depth.size for p in settled.views] or [0]))
     return len(settled.moved) * pose + sum(float(_left(ground, settled, p).sum()) for p in settled.views)
 
 

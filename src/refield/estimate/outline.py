@@ -26,7 +26,6 @@ from refield.vision.segmenter import Segmenter, cut_out
 
 FEWEST_POINTS = 30
 """of an object's surface; of fewer it cannot be found again"""
-_TIMES = 3  # that the box around a piece is made three times as wide in search of the whole
 _MORE = 1.5  # times a piece's volume, that a whole must have to be another thing
 _FOUND = 0.25  # of an object's voxels that a segmenter must leave to be believed
 
@@ -137,27 +136,21 @@ def standing(
 ) -> Old | None:
     """The whole thing that an outline is a piece of, if it stands free; None if there is no more of it.
 
-    Of a thing that slid, only what it hides and shows by that is changed.
+    Of a thing that slid, only what it hides and shows by that is changed: strips, about as long as it is wide.
     """
     places = piece.lattice.centres[piece.voxels]
-    low, high = places.min(0), places.max(0)
-    for _ in range(_TIMES):
-        side = float((high - low).max())
-        low, high = low - side, high + side
-        patches = look_around(field, frames, corners_of(low, high), config.rays)
-        if not patches:
-            return None
-        lattice = Lattice.over(low, high, config.longest)
-        free = _free(lattice, planes)
-        solid = carve_solid(lattice, patches, config.through, 3 * side) & free
-        start = piece.lattice.holds(piece.voxels, lattice.centres)
-        parts = [p for p in components(solid, FEWEST_POINTS) if (p & start).any()]
-        if not parts:
-            return None
-        voxels = np.logical_or.reduce(parts)
-        if not _at_border(voxels):
-            break
-    else:
+    side = float((places.max(0) - places.min(0)).max())
+    low, high = places.min(0) - side, places.max(0) + side
+    patches = look_around(field, frames, corners_of(low, high), config.rays)
+    if not patches:
+        return None
+    lattice = Lattice.over(low, high, config.longest)
+    free = _free(lattice, planes)
+    solid = carve_solid(lattice, patches, config.through, 3 * side) & free
+    start = piece.lattice.holds(piece.voxels, lattice.centres)
+    parts = [p for p in components(solid, FEWEST_POINTS) if (p & start).any()]
+    voxels = np.logical_or.reduce(parts) if parts else np.zeros_like(solid)
+    if not parts or _at_border(voxels):
         return None
     voxels = ndimage.binary_fill_holes(voxels)
     cloud = surface_cloud(lattice, voxels, patches, config.points)

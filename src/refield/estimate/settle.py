@@ -18,8 +18,9 @@ from refield.estimate.consist import consistent
 from refield.estimate.detect import Changed
 from refield.estimate.fit import left_by, slid
 from refield.estimate.ground import Ground
-from refield.estimate.lattice import Voxels, grown
+from refield.estimate.lattice import Lattice, Voxels, grown
 from refield.estimate.likelihood import Settled, unexplained_by
+from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import standing
 from refield.estimate.past import changed_share
@@ -49,38 +50,43 @@ class _Wholes:
     """The things that outlines are pieces of, looked for once."""
 
     ground: Ground
-    known: dict[int, Old | None] = field(default_factory=dict)
+    known: dict[int, tuple[Old, Old | None]] = field(default_factory=dict)
+    """by the piece's identity, which it keeps for as long as it is here"""
 
-    def of(self, pieces: Sequence[Old]) -> list[Old]:
-        """The whole things, where they stand free, each once."""
-        out: list[Old] = []
-        for piece in pieces:
-            if any(_within(piece, whole) for whole in out):
+    def of(self, pieces: dict[int, Old]) -> list[tuple[int, Old]]:
+        """The whole things, where they stand free, each once, by one of its pieces."""
+        out: list[tuple[int, Old]] = []
+        for k, piece in pieces.items():
+            if any(_within(piece, whole) for _, whole in out):
                 continue
             if id(piece) not in self.known:
                 g = self.ground
-                self.known[id(piece)] = standing(g.field, g.photographed, piece, g.planes, g.shape)
-            whole = self.known[id(piece)]
-            out += [whole] if whole is not None else []
+                self.known[id(piece)] = piece, standing(g.field, g.photographed, piece, g.planes, g.shape)
+            whole = self.known[id(piece)][1]
+            out += [(k, whole)] if whole is not None else []
         return out
 
 
 def _exchanges(ground: Ground, changed: Sequence[Changed], best: Settled, wholes: _Wholes) -> Iterator[Settled]:
-    """The hypothesis with one object less that moved, or with one that slid about where it was.
-
-    The latter are not looked for before: what arrived is where they were, and most of them seems to have stayed.
-    """
+    """The hypothesis with one object less that moved, or with one that slid."""
     olds = dict(enumerate(best.olds))
     for k in best.moved:
         others = {j: c for j, c in best.moved.items() if j != k}
         yield _completed(ground, olds, best.touched, changed, others)
-    if not best.arrived and (best.moved or best.removed):
-        return
-    pieces = {k: old for k, old in olds.items() if k not in best.removed}
-    asked = [(k, one) for k, old in pieces.items() for one in (old, old.instead) if one is not None]
-    for whole in wholes.of(list(pieces.values())):
-        asked.append((next(k for k, old in pieces.items() if _within(old, whole)), whole))
-    for k, one in asked:
+    if best.arrived or not (best.moved or best.removed):
+        yield from _slides(ground, changed, best, wholes)
+
+
+def _slides(ground: Ground, changed: Sequence[Changed], best: Settled, wholes: _Wholes) -> Iterator[Settled]:
+    """The hypothesis with one object that slid about where it was, by less than its width.
+
+    Those are not looked for before: what seems to have arrived is where they were, and most of them to have stayed.
+    """
+    olds = dict(enumerate(best.olds))
+    came = [_box(ground.hull.lattice, part) for part in best.arrived]
+    some = {k: old for k, old in olds.items() if k not in best.removed and _beside(_box(old.lattice, old.voxels), came)}
+    asked = [(k, one) for k, old in some.items() for one in (old, old.instead) if one is not None]
+    for k, one in [*asked, *wholes.of(some)]:
         apart = [j for j in best.touched if j != k and not _within(olds[j], one)]
         others = {j: c for j, c in best.moved.items() if j in apart}
         gone = [one, *(olds[j] for j in apart if j in best.moved or j in best.removed)]
@@ -88,6 +94,20 @@ def _exchanges(ground: Ground, changed: Sequence[Changed], best: Settled, wholes
         fit = slid(ground, one, gone, views)
         if fit is not None:
             yield _completed(ground, olds | {k: fit.old}, [k, *apart], changed, others | {k: fit.change})
+
+
+def _box(lattice: Lattice, voxels: Voxels) -> Array:
+    """The box around some voxels, (2, 3) world."""
+    at = lattice.centres[voxels]
+    return np.stack([at.min(0), at.max(0)])
+
+
+def _beside(box: Array, others: Sequence[Array]) -> bool:
+    """Whether a box is no further from one of the others than either is long, in each direction; true of none."""
+    apart = [
+        np.maximum(box[0] - o[1], o[0] - box[1]).max() - max((b[1] - b[0]).max() for b in (box, o)) for o in others
+    ]
+    return not apart or min(apart) <= 0
 
 
 def _within(piece: Old, whole: Old) -> bool:
