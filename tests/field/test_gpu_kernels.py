@@ -6,7 +6,6 @@ import importlib.util
 import os
 import sys
 from copy import deepcopy
-from functools import partialmethod
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,6 @@ from refield.field.encoding import geometric_levels
 from refield.field.fit import FitConfig
 from refield.field.kernels import reference
 from refield.field.kernels.reference import Aim, Batch, Stepped
-from refield.field.occupancy import OccupancyTrainer
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
 from refield.field.photos import HeldOut, Photos
 from refield.field.pixels import PixelBank
@@ -519,7 +517,6 @@ def test_the_loop_finds_out_about_photos_as_the_fit_goes_on(tmp_path: Path, monk
     monkeypatch.setattr(GraphedStep, "replay", GraphedStep.run_eager)
     monkeypatch.setattr(gpu, "train_step", roomy)
     monkeypatch.setattr(HeldOut, "tells_exposures", lambda self, model: True)
-    monkeypatch.setattr(OccupancyTrainer, "settle", partialmethod(OccupancyTrainer.settle, rays=500))
     capture = room(tmp_path)
     shape = HashFieldConfig(levels=2, coarsest=8, finest=16, log2_table=10, width=16)
     asked = PhotoModelConfig(exposures=True, poses=True, trust=True)
