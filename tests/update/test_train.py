@@ -158,10 +158,10 @@ def test_what_judges_is_never_fitted_to(case: tuple[Capture, SceneChange], monke
     wrapped(train, "spared", judged, 1)
     own = train.HelperTraining
 
-    def watched(helper: HashField, frozen: Field, told: Lit, judge: Lit, *more: Any) -> HelperTraining:
+    def watched(helper: HashField, frozen: Field, told: Lit, new: int, judge: Lit, *more: Any) -> HelperTraining:
         taught.append(told.lessons)
         judged.append(judge.lessons)
-        return own(helper, frozen, told, judge, *more)
+        return own(helper, frozen, told, new, judge, *more)
 
     monkeypatch.setattr(train, "HelperTraining", watched)
     update_field(capture, OLD_FIELD, change, steps(1))

@@ -86,5 +86,5 @@ def test_a_helper_is_told_what_was_looked_through() -> None:
     sight = sight_of(frozen.pretrained, frames(), [BOX])
     x = torch.tensor([[0.7, 0.0, 0.0], [0.0, 0.0, 0.48]])  # beside the ball; at its surface
     for known, tolls in ((sight, [HelperConfig.emptiness, 0.0]), (None, [0.0, 0.0])):
-        run = HelperTraining(helper, frozen, nothing, nothing, HelperConfig(), torch.Generator(), (), known)
+        run = HelperTraining(helper, frozen, nothing, 0, nothing, HelperConfig(), torch.Generator(), (), known)
         assert run.misplaced[helper.sampler.cells(x)].tolist() == pytest.approx(tolls)

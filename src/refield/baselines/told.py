@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from scipy.ndimage import binary_erosion, distance_transform_edt
 from torch import Tensor
@@ -40,7 +41,10 @@ def carried_along(capture: Capture, since: Since, change: SceneChange) -> Since:
 
 
 def _inside(thing: ObjectChange, index: int, frame: Frame) -> Tensor | None:
-    """Pixels of an old training photo that show the object and nothing else, (H, W) bool; None if unsure."""
+    """Pixels of an old training photo that show the object and nothing else, (H, W) bool; None if unsure.
+
+    Where the change tells no masks they are the object's silhouette, whatever stands before it.
+    """
     mask = Place(thing.masks, thing.grid, arrived_only=False).mask(index, frame)
     return None if mask is None else torch.from_numpy(binary_erosion(mask, iterations=_EDGE))
 
@@ -53,7 +57,8 @@ def left_empty(change: SceneChange) -> tuple[OccupancyGrid, ...]:
 
 def _deep(grid: OccupancyGrid, taken: Sequence[OccupancyGrid]) -> OccupancyGrid:
     """What of a grid lies deeper than its rim, where none of those ``taken`` holds anything."""
-    inside = distance_transform_edt((grid.values > 0.5).numpy(), sampling=grid.cell.tolist())
+    within = np.pad((grid.values > 0.5).numpy(), 1)  # nothing is known beyond the grid
+    inside = distance_transform_edt(within, sampling=grid.cell.tolist())[1:-1, 1:-1, 1:-1]
     free = torch.from_numpy(inside > rim(grid))
     for other in taken:
         free &= ~other.contains(grid.nodes())

@@ -30,7 +30,8 @@ def object_alone(
 ) -> Seen:
     """Colour (premultiplied), median depth and opacity of a moved object's own samples along rays.
 
-    The samples are where the field's own sampler has them: a field is only right at the spacing it was trained with.
+    The samples are where the field's own sampler has them in pictures: a field is only right near the spacing it was
+    trained with.
     Its colours are asked along directions that old photos looked along. ``sampler``: of `sampler_around`, if known.
     """
     grid, old_from_home = old.home

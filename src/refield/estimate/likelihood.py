@@ -27,7 +27,7 @@ from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
 _POSE = 3.0
-"""what a pose costs, in the fewest pixels that a thing must fill in a photo: for two of its six numbers as much"""
+"""times the fewest pixels that a thing must fill in a photo: what a pose costs, once for all photos"""
 _CAME, _UNKNOWN = 0.7, 0.4
 """what a pixel costs that may show anything, since something came there, or since nobody had seen what is behind"""
 

@@ -36,9 +36,9 @@ def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> S
     best = _completed(ground, dict(enumerate(olds)) | placed, list(placed), changed, moved)
     least, tried = unexplained_by(ground, best), _Wholes(ground)
     while True:
-        others = [(unexplained_by(ground, other), other) for other in _exchanges(ground, changed, best, tried)]
+        others = [(unexplained_by(ground, other), other) for other in _exchanges(ground, olds, changed, best, tried)]
         left, other = min(others, key=lambda o: o[0], default=(least, best))
-        if left >= least:
+        if not left < least - 1:  # pixel
             break
         best, least = other, left
     still = ground.believe.still
@@ -57,7 +57,7 @@ class _Wholes:
         """The whole things, where they stand free, each once, by one of its pieces."""
         out: list[tuple[int, Old]] = []
         for k, piece in pieces.items():
-            if any(_within(piece, whole) for _, whole in out):
+            if piece.remembered or any(_within(piece, whole) for _, whole in out):
                 continue
             if id(piece) not in self.known:
                 g = self.ground
@@ -67,12 +67,17 @@ class _Wholes:
         return out
 
 
-def _exchanges(ground: Ground, changed: Sequence[Changed], best: Settled, wholes: _Wholes) -> Iterator[Settled]:
-    """The hypothesis with one object less that moved, or with one that slid."""
+def _exchanges(
+    ground: Ground, first: Sequence[Old], changed: Sequence[Changed], best: Settled, wholes: _Wholes
+) -> Iterator[Settled]:
+    """The hypothesis with one object less that moved, as it was outlined at ``first``, or with one that slid."""
     olds = dict(enumerate(best.olds))
     for k in best.moved:
-        others = {j: c for j, c in best.moved.items() if j != k}
-        yield _completed(ground, olds, best.touched, changed, others)
+        whole = {k: first[k]} if k < len(first) else {}
+        rests = [j for j in best.touched if j >= len(first) and j != k and whole and _within(olds[j], first[k])]
+        touched = [j for j in best.touched if j not in rests]
+        others = {j: c for j, c in best.moved.items() if j != k and j in touched}
+        yield _completed(ground, olds | whole, touched, changed, others)
     if best.arrived or not (best.moved or best.removed):
         yield from _slides(ground, changed, best, wholes)
 
@@ -92,7 +97,7 @@ def _slides(ground: Ground, changed: Sequence[Changed], best: Settled, wholes: _
         gone = [one, *(olds[j] for j in apart if j in best.moved or j in best.removed)]
         views = without(ground, changed, gone, [(olds[j], c) for j, c in others.items()])
         fit = slid(ground, one, gone, views)
-        if fit is not None:
+        if fit is not None and _noticeable(fit.old, fit.change, ground.believe.still):
             yield _completed(ground, olds | {k: fit.old}, [k, *apart], changed, others | {k: fit.change})
 
 

@@ -28,6 +28,7 @@ from refield.update.supervision import Lessons
 from refield.update.unseen import Sight
 
 _RAYS = 1024, 8192  # of a step, at least and at most
+_NEW = 0.5  # of a step's rays from the new photos: they alone show what arrived, and are few beside the old
 _PER_RAY = 0.5  # samples of a ray, at least, when rays are counted out for a step
 
 
@@ -81,13 +82,17 @@ class Lit:
 
 
 class HelperTraining:
-    """One run: the helper between fixed segments, until held-out pixels stop gaining."""
+    """One run: the helper between fixed segments, until held-out pixels stop gaining.
+
+    The first ``new`` rays of those that are taught are of the new photos.
+    """
 
     def __init__(
         self,
         helper: HashField,
         frozen: UpdatedField,
         taught: Lit,
+        new: int,
         judge: Lit,
         config: HelperConfig,
         draw: torch.Generator,
@@ -95,7 +100,7 @@ class HelperTraining:
         sight: Sight | None = None,
     ) -> None:
         self.helper, self.config, self.frozen, self.draw = helper, config, frozen, draw
-        self.taught, self.judge = taught, judge
+        self.taught, self.new, self.judge = taught, new, judge
         added = tuple(o.grid for o in frozen.change.objects if o.kind == "added")
         taken = Region(added + frozen.bare.grids)
         self.misplaced = config.emptiness * emptiness(frozen.change, helper.sampler, taken, ground, sight)
@@ -173,10 +178,18 @@ class HelperTraining:
     def _taken(self, x: Tensor) -> Tensor:
         return self.frozen.arrived(x) >= 0
 
+    def _drawn(self) -> Tensor:
+        """Rays of a step, (N,) int64; ``new`` of those that teach, the first, are of the new photos."""
+        n, new, every = self.rays_per_step, self.new, len(self.taught.lessons)
+        if new in (0, every):
+            return torch.randint(every, (n,), generator=self.draw)
+        of_new = torch.randint(new, (round(n * _NEW),), generator=self.draw)
+        return torch.cat([of_new, torch.randint(new, every, (n - len(of_new),), generator=self.draw)])
+
     def _step(self, step: int, rate: float) -> None:
         helper, c, n = self.helper, self.config, self.rays_per_step
         lessons, fixed = self.taught.lessons, self.taught.fixed
-        chosen = torch.randint(len(lessons), (n,), generator=self.draw)
+        chosen = self._drawn()
         rays, sampler = lessons.rays[chosen], helper.sampler
         # what stays transparent is shown noise, so that only opaque surfaces explain the photos
         jitter, shown = (torch.rand(*shape, generator=self.draw) for shape in ((n,), (n, 3)))

@@ -50,7 +50,9 @@ def _unknown(field: Field | None) -> Region:
     """Where something stood while every helper learnt, at a place that the fitted field does not know either."""
     grids: list[OccupancyGrid] = []
     for update in () if field is None else layers_of(field):
-        if not isinstance(update, UpdatedField) or not update.untaught.grids:
+        if not isinstance(update, UpdatedField):
+            break
+        if not update.untaught.grids:
             continue
         was = carved(update.change, _TAUGHT * update.pretrained.sampler.step)
         for stood in update.untaught.grids:

@@ -102,7 +102,7 @@ def update_field(
     teaching, judging = (Lit(some, fixed_along(frozen, region, some.rays, ground)) for some in (taught, sparse.judging))
     say("train")
     helper = new_helper(region, change.frames, config.seed, directions=config.fit.directions)
-    run = HelperTraining(helper, frozen, teaching, judging, config.fit, draw, ground, sight)
+    run = HelperTraining(helper, frozen, teaching, len(sparse.taught), judging, config.fit, draw, ground, sight)
     run.run(on_progress)
     say("show")
     helper.requires_grad_(False)
