@@ -14,19 +14,16 @@ import statistics
 import time
 from dataclasses import asdict, replace
 from functools import partial
-from pathlib import Path
 
-import torch
 from estimate import PAPER, Bench
 from record import Row, markdown
+from tables.asked import PATIENT, bench_of, parser
 from tables.kept import Kept, Record, spread
 
 from refield.evaluate import evaluate
-from refield.synthetic.worlds import WORLDS
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.cut import CutConfig
-from refield.update.fit_helper import HelperConfig
 from refield.update.frozen import FreezeConfig
 from refield.update.ground import GroundConfig
 from refield.update.relight import RelightConfig
@@ -34,7 +31,6 @@ from refield.update.spared import ShowConfig
 from refield.update.supervision import SuperviseConfig
 from refield.update.train import update_field
 
-PATIENT = HelperConfig(max_seconds=600.0)  # a busy machine must not change what is found
 DEFAULT = UpdateConfig(fit=PATIENT)
 OFF: dict[str, UpdateConfig] = {
     "cut.sides": replace(DEFAULT, cut=CutConfig(sides=False)),
@@ -66,8 +62,7 @@ MEASURES = ("psnr_in", "psnr_out", "psnr_untouched")
 
 def main() -> None:
     options = _options()
-    torch.set_num_threads(options.threads)
-    bench = Bench(options.work, options.out, options.size, options.cameras, 1)
+    bench = bench_of(options)
     kept = Kept(options.out)
     for seed in range(options.seeds):
         for name in options.only:
@@ -78,16 +73,9 @@ def main() -> None:
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", nargs="+", choices=sorted(WORLDS), default=list(PAPER))
-    parser.add_argument("--only", nargs="+", choices=["default", *OFF], default=["default", *OFF])
-    parser.add_argument("--seeds", type=int, default=3, help="of the update; fields and photos are the same")
-    parser.add_argument("--size", type=int, default=128, help="pixels a side")
-    parser.add_argument("--cameras", type=int, default=70, help="old photos of a world")
-    parser.add_argument("--work", type=Path, default=Path("build/estimate-work"), help="worlds' photos and fields")
-    parser.add_argument("--out", type=Path, default=Path("build/departures"), help="results of every run")
-    parser.add_argument("--threads", type=int, default=1)
-    return parser.parse_args()
+    asked = parser(__doc__, PAPER, ["default", *OFF], "build/departures")
+    asked.add_argument("--seeds", type=int, default=3, help="of the update; fields and photos are the same")
+    return asked.parse_args()
 
 
 def _key(world: str, seed: int) -> str:

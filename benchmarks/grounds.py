@@ -15,13 +15,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
-from pathlib import Path
 from typing import get_args
 
 import torch
 from change_score import score
 from estimate import Bench, Scene, spread
 from record import Row, markdown
+from tables.asked import PATIENT, bench_of, parser
 from tables.kept import Kept, Record
 from torch import Tensor
 
@@ -34,14 +34,12 @@ from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import SceneChange
 from refield.synthetic.grounds import Ground
 from refield.synthetic.visibility import first_hits, view_hits
-from refield.synthetic.worlds import WORLDS
 from refield.update.config import UpdateConfig
-from refield.update.fit_helper import HelperConfig
 from refield.update.ground import GroundConfig
 from refield.update.train import update_field
 
-PATIENT = UpdateConfig(fit=HelperConfig(max_seconds=600.0))  # a busy machine must not change what is found
-NO_PLANES = replace(PATIENT, ground=GroundConfig(footholds=False, textured=False))
+DEFAULT = UpdateConfig(fit=PATIENT)
+NO_PLANES = replace(DEFAULT, ground=GroundConfig(footholds=False, textured=False))
 _SAME = 0.01  # metres; a photo shows a point if nothing is so far before it
 MEASURES = {
     "psnr_in": "in", "psnr_out": "out", "seen": "out, bare and seen", "hidden": "out, bare and hidden",
@@ -52,8 +50,7 @@ MEASURES = {
 
 def main() -> None:
     options = _options()
-    torch.set_num_threads(options.threads)
-    bench = Bench(options.work, options.out, options.size, options.cameras, 1)
+    bench = bench_of(options)
     kept = Kept(options.out)
     worlds = [w if g == "flat" else f"{w}-{g}" for w in options.worlds for g in options.grounds]
     for name in options.only:
@@ -63,16 +60,9 @@ def main() -> None:
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", nargs="+", choices=sorted(WORLDS), default=["cube", "sphere"])
-    parser.add_argument("--grounds", nargs="+", choices=get_args(Ground), default=list(get_args(Ground)))
-    parser.add_argument("--only", nargs="+", choices=list(METHODS), default=list(METHODS))
-    parser.add_argument("--size", type=int, default=128, help="pixels a side")
-    parser.add_argument("--cameras", type=int, default=70, help="old photos of a world")
-    parser.add_argument("--work", type=Path, default=Path("build/estimate-work"), help="worlds' photos and fields")
-    parser.add_argument("--out", type=Path, default=Path("build/grounds"), help="results of every run")
-    parser.add_argument("--threads", type=int, default=1)
-    return parser.parse_args()
+    asked = parser(__doc__, ["cube", "sphere"], list(METHODS), "build/grounds")
+    asked.add_argument("--grounds", nargs="+", choices=get_args(Ground), default=list(get_args(Ground)))
+    return asked.parse_args()
 
 
 def _run(bench: Bench, world: str, name: str) -> Record:
@@ -100,7 +90,7 @@ def _whole(scene: Scene, frames: Sequence[Frame]) -> tuple[Field, Record]:
     """The update by the estimated change."""
     change = estimate_change(scene.capture, scene.field, frames)
     found = score(change, scene.world, scene.truth(change.frames))
-    return _shown(scene, change, PATIENT), {"truth": asdict(found)}
+    return _shown(scene, change, DEFAULT), {"truth": asdict(found)}
 
 
 def _shown(scene: Scene, change: SceneChange, config: UpdateConfig) -> Field:
@@ -115,10 +105,10 @@ def _retrained(scene: Scene, frames: Sequence[Frame]) -> tuple[Field, Record]:
 
 METHODS: dict[str, tuple[int, Callable[[Scene, Sequence[Frame]], tuple[Field, Record]]]] = {
     "whole_4": (4, _whole),
-    "true_4": (4, partial(_true, PATIENT)),
+    "true_4": (4, partial(_true, DEFAULT)),
     "true_4_no_planes": (4, partial(_true, NO_PLANES)),
-    "true_2": (2, partial(_true, PATIENT)),
-    "true_1": (1, partial(_true, PATIENT)),
+    "true_2": (2, partial(_true, DEFAULT)),
+    "true_1": (1, partial(_true, DEFAULT)),
     "retrained_4": (4, _retrained),
 }
 """name -> how many new photos, and what is done with them"""

@@ -14,17 +14,15 @@ from __future__ import annotations
 import argparse
 import time
 from functools import partial
-from pathlib import Path
 
-import torch
 from estimate import Bench
 from record import Row, markdown
 from tables import paper
 from tables.again import ANEW, ROWS, Case, seen, seen_new
+from tables.asked import bench_of, parser
 from tables.kept import Kept, Record, spread
 
 from refield.baselines.curve import Point
-from refield.synthetic.worlds import WORLDS
 
 MEASURES = {
     "psnr_in": "in", "psnr_out": "out", "bare": "out, bare", "psnr_untouched": "untouched", "new": "new photos",
@@ -35,8 +33,7 @@ MEASURES = {
 
 def main() -> None:
     options = _options()
-    torch.set_num_threads(options.threads)
-    bench = Bench(options.work, options.out, options.size, options.cameras, 1)
+    bench = bench_of(options)
     kept = Kept(options.out)
     for seed in range(options.seeds):
         for world in options.worlds:
@@ -48,16 +45,9 @@ def main() -> None:
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", nargs="+", choices=sorted(WORLDS), default=["cube", "cone"])
-    parser.add_argument("--only", nargs="+", choices=list(ROWS), default=list(ROWS))
-    parser.add_argument("--seeds", type=int, default=3, help="of each training; photos and old fields are the same")
-    parser.add_argument("--size", type=int, default=128, help="pixels a side")
-    parser.add_argument("--cameras", type=int, default=70, help="old photos of a world")
-    parser.add_argument("--work", type=Path, default=Path("build/estimate-work"), help="worlds' photos and fields")
-    parser.add_argument("--out", type=Path, default=Path("build/retraining"), help="results of every run")
-    parser.add_argument("--threads", type=int, default=1)
-    return parser.parse_args()
+    asked = parser(__doc__, ["cube", "cone"], list(ROWS), "build/retraining")
+    asked.add_argument("--seeds", type=int, default=3, help="of each training; photos and old fields are the same")
+    return asked.parse_args()
 
 
 def _run(bench: Bench, world: str, seed: int, name: str) -> Record:

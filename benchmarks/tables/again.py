@@ -32,11 +32,10 @@ from refield.scene.load import load_capture
 from refield.synthetic.cameras import square_camera
 from refield.synthetic.write import shoot_state
 from refield.update.config import UpdateConfig
-from refield.update.fit_helper import HelperConfig
 from refield.update.train import update_field
+from tables.asked import PATIENT
 from tables.kept import Record
 
-PATIENT = UpdateConfig(fit=HelperConfig(max_seconds=600.0))  # a busy machine must not change what is found
 LONGER = 4  # times the usual steps
 _LOOKS = 12  # points of the curve of the longer one
 _ANEW = 7_000_003  # seed of the first photo's light paths: other noise than in the old photos
@@ -174,7 +173,9 @@ def _anew(case: Case) -> tuple[Field, Record]:
 
 
 def _update(case: Case) -> tuple[Field, Record]:
-    field = update_field(case.capture, case.scene.field, case.change, replace(PATIENT, seed=case.seed))
+    field = update_field(
+        case.capture, case.scene.field, case.change, replace(UpdateConfig(fit=PATIENT), seed=case.seed)
+    )
     return cast(Field, field), {}
 
 

@@ -109,11 +109,10 @@ def carried(view: View, config: DetectConfig) -> View:
     return replace(view, photo=np.clip(view.photo * fit[0] + fit[1], 0, 1).astype(np.float32), colour_fit=fit)
 
 
-def difference(view: View, config: DetectConfig) -> Array:
-    """(H, W) Lab difference of photo and rendering; 0 where the field itself is empty or a guess."""
+def difference(view: View, picture: Array, config: DetectConfig) -> Array:
+    """(H, W) Lab difference of a view's photo and a picture (H, W, 3) of what it should show."""
     sigma = blur_sigma(view, config)
-    found = pixels.colour_difference(pixels.blur(view.photo, sigma), pixels.blur(view.rgb, sigma), config.reach)
-    return found
+    return pixels.colour_difference(pixels.blur(view.photo, sigma), pixels.blur(picture, sigma), config.reach)
 
 
 def noise_at(view: View, survey: Sequence[Changed]) -> Array:
@@ -150,7 +149,7 @@ def _unchanged(view: View, config: DetectConfig) -> Changed:
     view = carried(view, config)
     nothing = np.zeros(view.shape, bool)
     none = np.full(view.shape, np.inf, np.float32)
-    return Changed(view, difference(view, config), none, nothing, nothing, nothing)
+    return Changed(view, difference(view, view.rgb, config), none, nothing, nothing, nothing)
 
 
 def _coverage(times: NDArray[Any]) -> NDArray[np.int64]:
@@ -172,7 +171,7 @@ def _by_coverage(errors: Array, of: NDArray[np.int64], quantile: float) -> Array
 def changes(views: Sequence[View], known: Errors, config: DetectConfig) -> list[Changed]:
     """Change masks of the new photos; light not yet set aside."""
     views = [carried(v, config) for v in views]
-    return _marked(views, [difference(v, config) for v in views], known, config)
+    return _marked(views, [difference(v, v.rgb, config) for v in views], known, config)
 
 
 def _marked(views: Sequence[View], diffs: Sequence[Array], known: Errors, config: DetectConfig) -> list[Changed]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from refield.estimate.alone import object_alone
 from refield.estimate.arrive import shadow_of
-from refield.estimate.detect import blur_sigma
+from refield.estimate.detect import difference
 from refield.estimate.explain import LIMIT, Compared, relit
 from refield.estimate.ground import Ground
 from refield.estimate.lattice import Voxels
@@ -24,7 +24,6 @@ from refield.estimate.objects import Old
 from refield.estimate.past import Past
 from refield.estimate.pose_change import SIDE, PoseChange
 from refield.scene.pose import invert, transform
-from refield.vision import pixels
 
 _POSE = 3.0
 """times the fewest pixels that a thing must fill in a photo: what a pose costs, once for all photos"""
@@ -63,8 +62,7 @@ def _left(ground: Ground, settled: Settled, p: Past) -> Array:
         anything, moved = (anything & ~shown) | bare, moved | shown
     for part in settled.arrived:
         came |= shadow_of(p.view, ground.hull.lattice, part)
-    sigma = blur_sigma(p.view, ground.detect)
-    apart = pixels.colour_difference(pixels.blur(p.view.photo, sigma), pixels.blur(picture, sigma), ground.detect.reach)
+    apart = difference(p.view, picture, ground.detect)
     wrong = LIMIT * p.changed.threshold * np.where(moved, LIMIT, 1)  # never seen in this light, nor by these cameras
     left = np.minimum((apart / wrong) ** 2, 1)
     left = np.where(p.changed.new | (p.changed.light & ~p.was), 0, left)

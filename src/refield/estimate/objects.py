@@ -142,6 +142,11 @@ class Old:
     def volume(self) -> float:
         return float(self.voxels.sum()) * self.lattice.cell**3
 
+    def within(self, other: Old) -> bool:
+        """Whether it is rather a piece of another outline: most of its voxels are in that one, or beside it."""
+        held = other.lattice.holds(grown(other.voxels, 1), self.lattice.centres[self.voxels])
+        return bool(held.mean() > 0.5)
+
     @cached_property
     def grid(self) -> OccupancyGrid:
         """Its mask M: with the whole of the field's soft surface, which is as thick as its samples are apart, and a

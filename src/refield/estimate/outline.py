@@ -103,9 +103,7 @@ def outline(
         voxels = cut
     if not voxels.any():
         return inner
-    voxels = ndimage.binary_fill_holes(voxels)
-    cloud = surface_cloud(lattice, voxels, patches, config.points)
-    old = Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= FEWEST_POINTS else None
+    old = _seen(lattice, voxels, free, patches, config)
     return old if inner is None else replace(inner, instead=old)
 
 
@@ -152,10 +150,15 @@ def standing(
     voxels = np.logical_or.reduce(parts) if parts else np.zeros_like(solid)
     if not parts or _at_border(voxels):
         return None
+    whole = _seen(lattice, voxels, free, patches, config)
+    return whole if whole is not None and whole.volume > _MORE * piece.volume else None
+
+
+def _seen(lattice: Lattice, voxels: Voxels, free: Voxels, patches: Sequence[Patch], config: ObjectConfig) -> Old | None:
+    """Voxels without holes as an object; None if the patches show too little of its surface."""
     voxels = ndimage.binary_fill_holes(voxels)
     cloud = surface_cloud(lattice, voxels, patches, config.points)
-    whole = Old(lattice, voxels, free, cloud, tuple(patches))
-    return whole if len(cloud.points) >= FEWEST_POINTS and whole.volume > _MORE * piece.volume else None
+    return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= FEWEST_POINTS else None
 
 
 def _free(lattice: Lattice, planes: Sequence[Plane]) -> Voxels:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 
-from refield.estimate.detect import Changed, DetectConfig, Mask, blur_sigma
+from refield.estimate.detect import Changed, DetectConfig, Mask, difference
 from refield.estimate.hull import HullConfig, tolerance
 from refield.estimate.lattice import grown
 from refield.estimate.look import Array, Hidden, View, see
@@ -94,8 +94,7 @@ def _look_past(
     gone = pixels.close(gone, 3)
     guess = was & ((memory.times_seen(view, depth) == 0) | _beneath(view, depth, olds))
     known = ~pixels.dilate(pixels.close(guess, 3), 1)
-    sigma = blur_sigma(view, config)
-    diff = pixels.colour_difference(pixels.blur(view.photo, sigma), pixels.blur(rgb, sigma), config.reach)
+    diff = difference(view, rgb, config)
     return Past(c, rgb, depth, gone, known, diff, np.zeros(view.shape, bool), depth)
 
 

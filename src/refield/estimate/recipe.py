@@ -291,11 +291,7 @@ def _were_there(
 
 def _whole(olds: list[Old]) -> list[Old]:
     """Objects that are not mere pieces of others."""
-
-    def within(piece: Old, other: Old) -> bool:
-        return other.lattice.holds(grown(other.voxels, 1), piece.lattice.centres[piece.voxels]).mean() > 0.5
-
-    return [o for o in olds if not any(k.volume > o.volume and within(o, k) for k in olds)]
+    return [o for o in olds if not any(k.volume > o.volume and o.within(k) for k in olds)]
 
 
 def _overlooked(scene: _Scene, ground: Ground, settled: Settled, parts: Parts, known: list[Old]) -> list[Old]:

@@ -18,7 +18,7 @@ from refield.estimate.consist import consistent
 from refield.estimate.detect import Changed
 from refield.estimate.fit import left_by, slid
 from refield.estimate.ground import Ground
-from refield.estimate.lattice import Lattice, Voxels, grown
+from refield.estimate.lattice import Lattice, Voxels
 from refield.estimate.likelihood import Settled, unexplained_by
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
@@ -57,7 +57,7 @@ class _Wholes:
         """The whole things, where they stand free, each once, by one of its pieces."""
         out: list[tuple[int, Old]] = []
         for k, piece in pieces.items():
-            if piece.remembered or any(_within(piece, whole) for _, whole in out):
+            if piece.remembered or any(piece.within(whole) for _, whole in out):
                 continue
             if id(piece) not in self.known:
                 g = self.ground
@@ -74,7 +74,7 @@ def _exchanges(
     olds = dict(enumerate(best.olds))
     for k in best.moved:
         whole = {k: first[k]} if k < len(first) else {}
-        rests = [j for j in best.touched if j >= len(first) and j != k and whole and _within(olds[j], first[k])]
+        rests = [j for j in best.touched if j >= len(first) and j != k and whole and olds[j].within(first[k])]
         touched = [j for j in best.touched if j not in rests]
         others = {j: c for j, c in best.moved.items() if j != k and j in touched}
         yield _completed(ground, olds | whole, touched, changed, others)
@@ -92,7 +92,7 @@ def _slides(ground: Ground, changed: Sequence[Changed], best: Settled, wholes: _
     some = {k: old for k, old in olds.items() if k not in best.removed and _beside(_box(old.lattice, old.voxels), came)}
     asked = [(k, one) for k, old in some.items() for one in (old, old.instead) if one is not None]
     for k, one in [*asked, *wholes.of(some)]:
-        apart = [j for j in best.touched if j != k and not _within(olds[j], one)]
+        apart = [j for j in best.touched if j != k and not olds[j].within(one)]
         others = {j: c for j, c in best.moved.items() if j in apart}
         gone = [one, *(olds[j] for j in apart if j in best.moved or j in best.removed)]
         views = without(ground, changed, gone, [(olds[j], c) for j, c in others.items()])
@@ -113,11 +113,6 @@ def _beside(box: Array, others: Sequence[Array]) -> bool:
         np.maximum(box[0] - o[1], o[0] - box[1]).max() - max((b[1] - b[0]).max() for b in (box, o)) for o in others
     ]
     return not apart or min(apart) <= 0
-
-
-def _within(piece: Old, whole: Old) -> bool:
-    """Whether most of an outline is part of another."""
-    return bool(whole.lattice.holds(grown(whole.voxels, 1), piece.lattice.centres[piece.voxels]).mean() > 0.5)
 
 
 def _completed(
