@@ -45,11 +45,11 @@ def outlined(work: Path, photos: Path) -> tuple[Sequence[Old], Sequence[Changed]
     capture, before = workspace.capture(), state(workspace, 0)
     kept: list[tuple[Sequence[Old], Sequence[Changed]]] = []
 
-    def stop(ground: Any, olds: Sequence[Old], changed: Sequence[Changed]) -> None:
-        kept.append((olds, changed))
+    def stop(search: recipe.Search, olds: Sequence[Old], _begun: Any = None) -> None:
+        kept.append((olds, search.changed))
         raise _Outlined
 
-    with patch.object(recipe, "settle", stop):
+    with patch.object(recipe.Search, "settle", stop):
         try:
             recipe.estimate_change(capture, before, load_new_photos(photos, capture))
         except _Outlined:

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from refield.estimate import recipe, settle
-from refield.estimate.ground import Ground
 from refield.estimate.lattice import grown
 from refield.estimate.likelihood import Settled, unexplained_by
 from refield.scene.pose import angle_between, transform
@@ -29,11 +28,12 @@ def settled(capture, folder, monkeypatch):
     """What an estimate settles on, with everything that it was settled from."""
     kept = []
 
-    def seen(ground: Ground, olds, changed) -> Settled:
-        kept.append((ground, olds, changed, settle.settle(ground, olds, changed)))
-        return kept[-1][-1]
+    class Seen(settle.Search):
+        def settle(self, olds, begun=None) -> Settled:
+            kept.append((self.ground, olds, self.changed, super().settle(olds, begun)))
+            return kept[-1][-1]
 
-    monkeypatch.setattr(recipe, "settle", seen)
+    monkeypatch.setattr(recipe, "Search", Seen)
     change = recipe.estimate_change(capture, BEFORE, new_photos(BoxWorld((CRATE.moved(AWAY),)), folder), CONFIG)
     return change, kept[-1]
 
@@ -80,17 +80,21 @@ def test_what_slid_by_less_than_its_width_is_found_where_it_hid(tmp_path, monkey
     assert [o.kind for o in without.objects] != ["moved"]
 
 
-def test_an_object_that_explains_nothing_is_taken_back(capture, tmp_path, monkeypatch):
-    """A pose that was believed at first, of a thing that never moved."""
+@pytest.mark.parametrize("known", [False, True])
+def test_an_object_that_explains_nothing_is_taken_back(capture, tmp_path, monkeypatch, known):
+    """A pose that was believed at first, of a thing that is elsewhere: where it was found before, if anywhere."""
     place_all = settle.place_all
 
-    def astray(ground, olds, changed, keys):
-        moved, placed = place_all(ground, olds, changed, keys)
+    def astray(ground, olds, changed, before, kept):
+        moved, placed = place_all(ground, olds, changed, before, kept)
         ((k, change),) = moved.items()
+        if not known:
+            kept[1].clear()
         wrong = turn(transform(AWAY, CENTRE), 180, (-0.3, 0.1, 0)) @ AWAY
         return {k: replace(change, new_from_old=wrong)}, placed
 
     monkeypatch.setattr(settle, "place_all", astray)
     monkeypatch.setattr(settle, "slid", lambda *_: None)
     change, _ = settled(capture, tmp_path, monkeypatch)
-    assert sorted(o.kind for o in change.objects) == ["added", "removed"]
+    assert sorted(o.kind for o in change.objects) == (["moved"] if known else ["added", "removed"])
+    assert not known or float(angle_between(change.objects[0].new_from_old, AWAY)) < 1.5

@@ -14,16 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from refield.estimate.alone import object_alone
 from refield.estimate.arrive import arrivals, newcomers, remarkable
 from refield.estimate.detect import Changed
-from refield.estimate.fit import Fit, fit_of, left_by
+from refield.estimate.fit import Fit, fit_again, fit_of, left_by
 from refield.estimate.ground import Ground
 from refield.estimate.matched import matched_poses
 from refield.estimate.objects import Old
-from refield.estimate.past import Past, changed_share, look_past, silhouette
+from refield.estimate.past import Past, changed_share, silhouette
 from refield.estimate.pose_change import PoseChange
-from refield.field.radiance import Field
 from refield.scene.pose import transform
 from refield.vision import pixels
 
@@ -43,34 +41,49 @@ def without(
     ground: Ground, changed: Sequence[Changed], olds: Sequence[Old], placed: Sequence[tuple[Old, PoseChange]] = ()
 ) -> list[Past]:
     """The photos past some objects, with those that were placed taken off."""
-    views = look_past(ground.field, changed, ground.memory, olds, (ground.detect, ground.carving))
+    views = ground.past(changed, olds)
     for old, change in placed:
-        views = take_off(ground.field, views, old, change)
+        views = take_off(ground, views, old, change)
     return views
 
 
 def place_all(
-    ground: Ground, olds: dict[int, Old], changed: Sequence[Changed], keys: Iterator[int]
+    ground: Ground,
+    olds: tuple[dict[int, Old], dict[int, Old]],
+    changed: Sequence[Changed],
+    moved: dict[int, PoseChange],
+    kept: tuple[Iterator[int], dict[int, list[Fit]]],
 ) -> tuple[dict[int, PoseChange], dict[int, Old]]:
     """Place the changed objects that fit somewhere, in the photos without those that certainly left, then without all.
 
     What a newcomer hides may look like a thing that changed; where that is taken out, nobody knows what is behind, and
     the newcomer is not looked for.
+
+    Args:
+        olds: the objects that are known to have moved or left, and those that are placed now.
+        moved: where the former are.
+        kept: numbers for what outlines are cut into; and all places that were found for each object at any time.
     """
-    sure = [k for k, old in olds.items() if left_by(ground, without(ground, changed, [old]), old) is not None]
-    others = [k for k in olds if k not in sure]
-    moved: dict[int, PoseChange] = {}
-    for out, asked in [(sure, sure), (list(olds), others)] if sure and others else [(list(olds), list(olds))]:
-        views = without(ground, changed, [olds[k] for k in out], [(olds[k], c) for k, c in moved.items()])
-        more, placed = _place(ground, {k: olds[k] for k in out}, asked, views, keys)
-        moved, olds = moved | more, olds | placed
-    return moved, olds
+    (there, asked), known = olds, olds[0] | olds[1]
+    sure = [k for k, old in asked.items() if left_by(ground, without(ground, changed, [old]), old) is not None]
+    others = [k for k in asked if k not in sure]
+    for out, some in [(sure, sure), (list(asked), others)] if sure and others else [(list(asked), list(asked))]:
+        gone = {k: known[k] for k in (*there, *out)}
+        views = without(ground, changed, list(gone.values()), [(known[k], c) for k, c in moved.items()])
+        more, placed = _place(ground, gone, some, views, kept)
+        moved, known = moved | more, known | placed
+    return moved, known
 
 
 def _place(
-    ground: Ground, olds: dict[int, Old], asked: Sequence[int], views: list[Past], keys: Iterator[int]
+    ground: Ground,
+    olds: dict[int, Old],
+    asked: Sequence[int],
+    views: list[Past],
+    kept: tuple[Iterator[int], dict[int, list[Fit]]],
 ) -> tuple[dict[int, PoseChange], dict[int, Old]]:
     """Place some of the objects that ``views`` are without, the best first, taking each off."""
+    keys, found = kept
     moved: dict[int, PoseChange] = {}
     tried = {k: olds[k] for k in asked[: ground.believe.most]}
     everyone, first = list(olds.values()), views
@@ -83,9 +96,15 @@ def _place(
         # what moved before moves again: a piece of something else is tried only on what that leaves unexplained
         for again in (True, False):
             some = [k for k, old in tried.items() if old.remembered == again and k not in moved and parts]
-            tries = {k: fit_of(ground, olds[k], everyone, views, (parts, left), guess(k)) for k in some}
+            tries = {
+                k: fit_again(ground, everyone, views, found[k])
+                or fit_of(ground, olds[k], everyone, views, (parts, left), guess(k))
+                for k in some
+            }
             enough = {k: ground.believe.shown if k in cut else 0.0 for k in some}
             fits |= {k: fit for k, fit in tries.items() if fit is not None and fit.change.explained >= enough[k]}
+            for k, fit in fits.items():
+                found[k].append(fit)
             if any(fit.change.explained >= ground.believe.shown for fit in fits.values()):
                 break
         if not fits:
@@ -97,7 +116,7 @@ def _place(
                 another = next(keys)
                 olds[another] = tried[another] = rest
                 cut.add(another)
-            views = take_off(ground.field, views, olds[k], moved[k])
+            views = take_off(ground, views, olds[k], moved[k])
 
 
 def _together(fits: dict[int, Fit], enough: float) -> list[int]:
@@ -120,12 +139,12 @@ def places_of(olds: Sequence[Old], placed: Sequence[tuple[Old, PoseChange]]) -> 
     return [(old, still) for old in olds] + [(old, change.new_from_old) for old, change in placed]
 
 
-def take_off(field: Field, past: Sequence[Past], old: Old, change: PoseChange) -> list[Past]:
+def take_off(ground: Ground, past: Sequence[Past], old: Old, change: PoseChange) -> list[Past]:
     """The photos once a placed object is accounted for: its pixels are explained, and it stands in front."""
     out = []
     for p in past:
         view = p.view
-        alone = object_alone(field, old, view.rays, change.new_from_old)
+        alone = ground.object_alone(old, view, change)
         depth = alone.depth.numpy()
         shown = ((alone.opacity > 0.5).numpy() & (depth <= p.depth.ravel() + 0.5 * old.radius)).reshape(view.shape)
         shown = pixels.dilate(shown, 2)

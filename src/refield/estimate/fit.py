@@ -12,6 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from refield.estimate.arrive import shadow_of
+from refield.estimate.comoving import with_comoving
 from refield.estimate.detail import Detail, detail_of
 from refield.estimate.explain import explained_before
 from refield.estimate.ground import Ground
@@ -67,12 +68,38 @@ def fit_of(
         if fit is not None and fit.change.explained >= ground.believe.shown:
             return fit
     whole = max(fits, key=lambda f: f.change.explained, default=None)
-    if old.remembered or not newcomers_left:
+    if old.remembered:
         return whole
-    part = _part_of(ground, outlines[-1], olds, past, newcomers_left, extra)
-    if part is None or (whole is not None and whole.change.net >= part.change.net):
-        return whole
-    return part
+    if whole is not None:
+        along = _along(ground, whole, olds, past)
+        return along if along is not None and along.change.net > whole.change.net else whole
+    return _part_of(ground, outlines[-1], olds, past, newcomers_left, extra) if newcomers_left else None
+
+
+def _along(ground: Ground, fit: Fit, olds: Sequence[Old], past: Sequence[Past]) -> Fit | None:
+    """A thing that was found, outlined by what went along with it; what did not is the rest."""
+    along = with_comoving(ground, fit.old, past, fit.change.new_from_old)
+    if along is None:
+        return None
+    found = _refined(ground, along, olds, past, [fit.change.new_from_old], fit.score, ground.believe.gains)
+    if found is None:
+        return None
+    return replace(found, rest=rest_of(ground, fit.old, along))
+
+
+def rest_of(ground: Ground, old: Old, part: Old) -> Old | None:
+    """What an outline holds beside a thing; None if that could not be found again."""
+    left = components(old.voxels & ~part.lattice.holds(part.voxels, old.lattice.centres), FEWEST_POINTS)
+    rest = restricted(old, left[0], ground.shape) if left else None
+    return rest if rest is not None and len(rest.cloud.points) >= FEWEST_POINTS else None
+
+
+def fit_again(ground: Ground, olds: Sequence[Old], past: Sequence[Past], found: Sequence[Fit]) -> Fit | None:
+    """The best of the places at which an object was found before, if the photos still show it there for certain."""
+    gains = ground.believe.gains
+    again = [_refined(ground, f.old, olds, past, [f.change.new_from_old], f.score, gains) for f in found]
+    best = max((f for f in again if f is not None), key=lambda f: f.change.explained, default=None)
+    return best if best is not None and best.change.explained >= ground.believe.shown else None
 
 
 def _part_of(
@@ -169,7 +196,6 @@ def _refined(
 
     ``gains``: the part of its pixels by which they must show more of it than of what was there.
     """
-    believe = ground.believe
     best: PoseChange | None = None
     sight = Sight(ground.field, old, past, olds)
     for pose in poses:
@@ -182,13 +208,21 @@ def _refined(
     if best is None:
         return None
     old, best = trimmed(ground, sight, best)
+    return Fit(score, old, best) if believed(ground, old, past, best, gains) else None
+
+
+def believed(ground: Ground, old: Old, past: Sequence[Past], change: PoseChange, gains: float | None = None) -> bool:
+    """Whether the photos show an object where a pose change puts it.
+
+    ``gains``: the part of its pixels by which they must show more of it than of what was there.
+    """
+    believe = ground.believe
+    gains = believe.gains if gains is None else gains
     least = believe.explains * min(1.0, max(0.5, shown_right(ground, old, past) / believe.shown))
-    gains *= 2 if best.before > believe.alike else 1
-    if is_sunk(ground, old, best):  # possible, off the edge of a table; but a crumb of floor fits anywhere
-        least = max(least, ground.believe.sunk)
-    if best.explained < max(least, best.before + gains):
-        return None
-    return Fit(score, old, best)
+    gains *= 2 if change.before > believe.alike else 1
+    if is_sunk(ground, old, change):  # possible, off the edge of a table; but a crumb of floor fits anywhere
+        least = max(least, believe.sunk)
+    return change.explained >= max(least, change.before + gains)
 
 
 def _detail(ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor) -> Detail | None:

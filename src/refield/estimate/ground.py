@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from refield.estimate.detect import DetectConfig
+from refield.estimate.alone import object_alone
+from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.hull import Hull, HullConfig
+from refield.estimate.kept import Kept
 from refield.estimate.lattice import Voxels
-from refield.estimate.look import Array, View
+from refield.estimate.look import Array, Seen, View
 from refield.estimate.memory import Memory
+from refield.estimate.objects import Old
 from refield.estimate.outline import ObjectConfig
-from refield.estimate.pose_change import RefineConfig
+from refield.estimate.past import Past, look_past
+from refield.estimate.pose_change import PoseChange, RefineConfig
 from refield.estimate.register import RegisterConfig
 from refield.field.radiance import Field
 from refield.scene.capture import Frame
@@ -81,3 +86,20 @@ class Ground:
     search: RegisterConfig
     fine: RefineConfig
     matcher: Matcher
+    pasts: Kept[list[Past]] = dataclasses.field(default_factory=lambda: Kept(24))
+    """the photos past some objects"""
+    alone: Kept[Seen] = dataclasses.field(default_factory=lambda: Kept(128))
+    """a moved object's own picture in a photo"""
+
+    def past(self, changed: Sequence[Changed], olds: Sequence[Old]) -> list[Past]:
+        """The photos past some objects."""
+        return self.pasts.get(
+            (*changed, *olds),
+            lambda: look_past(self.field, changed, self.memory, olds, (self.detect, self.carving)),
+        )
+
+    def object_alone(self, old: Old, view: View, change: PoseChange) -> Seen:
+        """A moved object's own picture in a photo."""
+        return self.alone.get(
+            (old, view, change), lambda: object_alone(self.field, old, view.rays, change.new_from_old)
+        )

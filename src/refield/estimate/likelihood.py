@@ -7,13 +7,13 @@ nobody knows what is behind, costs less than what is wrong, and more than what i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from refield.estimate.alone import object_alone
 from refield.estimate.arrive import shadow_of
 from refield.estimate.detect import difference
 from refield.estimate.explain import LIMIT, Compared, relit
@@ -25,8 +25,9 @@ from refield.estimate.past import Past
 from refield.estimate.pose_change import SIDE, PoseChange
 from refield.scene.pose import invert, transform
 
-_POSE = 3.0
-"""times the fewest pixels that a thing must fill in a photo: what a pose costs, once for all photos"""
+_BODY = 3.0
+"""times the fewest pixels that a thing must fill in a photo: what one that left costs, for all photos, and again as
+much where it went"""
 _CAME, _UNKNOWN = 0.7, 0.4
 """what a pixel costs that may show anything, since something came there, or since nobody had seen what is behind"""
 
@@ -48,25 +49,47 @@ class Settled:
 
 
 def unexplained_by(ground: Ground, settled: Settled) -> float:
-    """Pixels, over all new photos, that a hypothesis does not explain, and what its poses cost."""
-    pose = _POSE * ground.believe.smallest * float(np.mean([p.view.depth.size for p in settled.views] or [0]))
-    return len(settled.moved) * pose + sum(float(_left(ground, settled, p).sum()) for p in settled.views)
+    """Pixels, over all new photos, that a hypothesis does not explain, and what its bodies cost."""
+    left = [_left(ground, settled, p) for p in settled.views]
+    return _total(ground, settled, [np.where(_came(ground, settled, p), _CAME, e) for p, e in zip(settled.views, left)])
+
+
+def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
+    """The hypothesis without newcomers that explain no more than they cost, and what it leaves unexplained."""
+    left = [_left(ground, settled, p) for p in settled.views]
+    arrived = []
+    for part in settled.arrived:
+        shown = [shadow_of(p.view, ground.hull.lattice, part) for p in settled.views]
+        if sum(float((e[here] - _CAME).sum()) for here, e in zip(shown, left)) > 0:
+            arrived.append(part)
+            left = [np.where(here, _CAME, e) for here, e in zip(shown, left)]
+    settled = replace(settled, arrived=tuple(arrived))
+    return settled, _total(ground, settled, left)
+
+
+def _total(ground: Ground, settled: Settled, left: Sequence[Array]) -> float:
+    body = _BODY * ground.believe.smallest * float(np.mean([e.size for e in left] or [0]))
+    return (2 * len(settled.moved) + len(settled.removed)) * body + sum(float(e.sum()) for e in left)
+
+
+def _came(ground: Ground, settled: Settled, p: Past) -> NDArray[np.bool_]:
+    """Pixels (H, W) of a photo that show what arrived."""
+    shown = [shadow_of(p.view, ground.hull.lattice, part) for part in settled.arrived]
+    return np.logical_or.reduce([np.zeros(p.view.shape, bool), *shown])
 
 
 def _left(ground: Ground, settled: Settled, p: Past) -> Array:
-    """(H, W) in [0, 1], what is left unexplained of each pixel of a photo."""
-    picture, anything, came = p.rgb, p.was & ~p.known, np.zeros(p.view.shape, bool)
+    """(H, W) in [0, 1], what is left unexplained of each pixel of a photo, but for what arrived."""
+    picture, anything = p.rgb, p.was & ~p.known
     depth, moved = p.beyond, np.zeros(p.view.shape, bool)
     for k, change in settled.moved.items():
         picture, depth, shown, bare = _before(ground, settled.olds[k], change, p, picture, depth)
         anything, moved = (anything & ~shown) | bare, moved | shown
-    for part in settled.arrived:
-        came |= shadow_of(p.view, ground.hull.lattice, part)
     apart = difference(p.view, picture, ground.detect)
     wrong = LIMIT * p.changed.threshold * np.where(moved, LIMIT, 1)  # never seen in this light, nor by these cameras
     left = np.minimum((apart / wrong) ** 2, 1)
     left = np.where(p.changed.new | (p.changed.light & ~p.was), 0, left)
-    return np.asarray(np.where(came, _CAME, np.where(anything, _UNKNOWN, left)), np.float32)
+    return np.asarray(np.where(anything, _UNKNOWN, left), np.float32)
 
 
 def _before(
@@ -75,7 +98,7 @@ def _before(
     """The picture (H, W, 3) and its depth with a moved object in it, in the light in which the photo shows it; the
     pixels that show it, and those of them that show what no old photo saw of it."""
     view, pose = p.view, change.new_from_old
-    alone = object_alone(ground.field, old, view.rays, pose)
+    alone = ground.object_alone(old, view, change)
     own, alpha, at = (t.reshape(*view.shape, -1).numpy() for t in (alone.rgb, alone.opacity, alone.depth))
     front = at[..., 0] <= depth + 2 * view.pixel_angle * np.where(np.isfinite(depth), depth, 0)
     alpha = np.where(front, alpha[..., 0], 0)

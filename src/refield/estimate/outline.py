@@ -89,7 +89,7 @@ def outline(
         return None
     lattice = Lattice.over(low, high, config.longest)
     solid = carve_solid(lattice, patches, config.through, float((places.max(0) - places.min(0)).max()))
-    free = _free(lattice, planes)
+    free = free_voxels(lattice, planes)
     voxels, stands_free = _connected(lattice, solid & free, seeds, config)
     inner = None
     if voxels.any() and not stands_free:
@@ -103,7 +103,7 @@ def outline(
         voxels = cut
     if not voxels.any():
         return inner
-    old = _seen(lattice, voxels, free, patches, config)
+    old = seen_as(lattice, voxels, free, patches, config)
     return old if inner is None else replace(inner, instead=old)
 
 
@@ -123,7 +123,7 @@ def remembered(
     if not patches or not voxels.any():
         return None
     cloud = surface_cloud(lattice, voxels, patches, config.points)
-    free = _free(lattice, planes)
+    free = free_voxels(lattice, planes)
     if len(cloud.points) < FEWEST_POINTS:
         return None
     return Old(lattice, voxels, free, cloud, tuple(patches), remembered=True, source=known.source)
@@ -143,25 +143,27 @@ def standing(
     if not patches:
         return None
     lattice = Lattice.over(low, high, config.longest)
-    free = _free(lattice, planes)
+    free = free_voxels(lattice, planes)
     solid = carve_solid(lattice, patches, config.through, 3 * side) & free
     start = piece.lattice.holds(piece.voxels, lattice.centres)
     parts = [p for p in components(solid, FEWEST_POINTS) if (p & start).any()]
     voxels = np.logical_or.reduce(parts) if parts else np.zeros_like(solid)
     if not parts or _at_border(voxels):
         return None
-    whole = _seen(lattice, voxels, free, patches, config)
+    whole = seen_as(lattice, voxels, free, patches, config)
     return whole if whole is not None and whole.volume > _MORE * piece.volume else None
 
 
-def _seen(lattice: Lattice, voxels: Voxels, free: Voxels, patches: Sequence[Patch], config: ObjectConfig) -> Old | None:
+def seen_as(
+    lattice: Lattice, voxels: Voxels, free: Voxels, patches: Sequence[Patch], config: ObjectConfig
+) -> Old | None:
     """Voxels without holes as an object; None if the patches show too little of its surface."""
     voxels = ndimage.binary_fill_holes(voxels)
     cloud = surface_cloud(lattice, voxels, patches, config.points)
     return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= FEWEST_POINTS else None
 
 
-def _free(lattice: Lattice, planes: Sequence[Plane]) -> Voxels:
+def free_voxels(lattice: Lattice, planes: Sequence[Plane]) -> Voxels:
     """Voxels in front of what holds things up."""
     free = np.ones(lattice.shape, bool)
     for plane in planes:

@@ -30,7 +30,7 @@ from refield.estimate.paper.route import estimate_change_paper
 from refield.estimate.place import PlaceConfig, place
 from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
-from refield.estimate.settle import looks_gone, settle, unexplained
+from refield.estimate.settle import Search, looks_gone, unexplained
 from refield.field.radiance import Field, check_field
 from refield.field.source import Known
 from refield.scene.capture import Capture, Frame, check_capture, check_frames
@@ -149,10 +149,11 @@ def estimate_change(
         field, carved, free, up, scene.planes, scene.survey, scene.errors.memory, photographed,
         config.detect, config.hull, config.objects, config.associate, config.register, config.refine, models.matcher,
     )  # fmt: skip
-    settled = settle(ground, olds, scene.changed)
+    search = Search(ground, scene.changed)
+    settled = search.settle(olds)
     more = _overlooked(scene, ground, settled, parts, olds) if parts.things else []
     if more:
-        settled = settle(ground, _whole([*olds, *more]), scene.changed)
+        settled = search.settle(_whole(more), settled)
     say("segment")
     answer = concluded(Told(field, capture.train, scene.changed, photos, carved, scene.errors), settled)
     return replace(answer, why=answer.why + _never_seen(scene.changed))

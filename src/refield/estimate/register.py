@@ -22,6 +22,8 @@ from refield.scene.pose import angle_between, rigid, transform
 from refield.vision import pixels
 
 _F64 = NDArray[np.float64]
+_FIRST = 2  # Gauss–Newton steps of all starting poses
+_LIKELY = 0.25  # of them go on
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,10 @@ class _Search:
         """The best of some starting poses, improved coarse to fine, best first."""
         c = self.config
         rotations, centres = rotations.copy(), centres.copy()
-        scores = self.run(rotations, centres, c.points, c.steps, c.coarse_blur)
+        scores = self.run(rotations, centres, c.points, _FIRST, c.coarse_blur)
+        likely = np.argsort(scores)[: max(c.keep, round(len(scores) * _LIKELY))]
+        rotations, centres = rotations[likely], centres[likely]
+        scores = self.run(rotations, centres, c.points, c.steps - _FIRST, c.coarse_blur)
         some = self.distinct(rotations, centres, scores, c.keep, 8.0)
         rotations, centres = rotations[some].copy(), centres[some].copy()
         self.run(rotations, centres, 2 * c.points, 10, 0.5 * (c.coarse_blur + c.fine_blur))

@@ -5,8 +5,10 @@ Begun with the objects placed one by one, then changed by one exchange at a time
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import count
 
 import numpy as np
@@ -14,91 +16,188 @@ import torch
 
 from refield.estimate.arrive import arrivals, fresh, newcomers, remarkable, shadow_of
 from refield.estimate.associate import may_have_changed, place_all, places_of, without
+from refield.estimate.comoving import with_comoving
 from refield.estimate.consist import consistent
 from refield.estimate.detect import Changed
-from refield.estimate.fit import left_by, slid
+from refield.estimate.fit import Fit, believed, left_by, rest_of, slid
 from refield.estimate.ground import Ground
+from refield.estimate.kept import Kept
 from refield.estimate.lattice import Lattice, Voxels
-from refield.estimate.likelihood import Settled, unexplained_by
+from refield.estimate.layers import Sight
+from refield.estimate.likelihood import Settled, judged
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import standing
-from refield.estimate.past import changed_share
-from refield.estimate.pose_change import PoseChange
+from refield.estimate.past import Past, changed_share
+from refield.estimate.pose_change import FINER, PoseChange, refine
 from refield.scene.pose import transform
 from refield.vision import pixels
 
 
-def settle(ground: Ground, olds: Sequence[Old], changed: Sequence[Changed]) -> Settled:
-    """Find each old object's new place or that it left, and what else arrived."""
-    touched = {k: old for k, old in enumerate(olds) if may_have_changed(ground, changed, old)}
-    moved, placed = place_all(ground, touched, changed, count(len(olds)))
-    best = _completed(ground, dict(enumerate(olds)) | placed, list(placed), changed, moved)
-    least, tried = unexplained_by(ground, best), _Wholes(ground)
-    while True:
-        others = [(unexplained_by(ground, other), other) for other in _exchanges(ground, olds, changed, best, tried)]
-        left, other = min(others, key=lambda o: o[0], default=(least, best))
-        if not left < least - 1:  # pixel
-            break
-        best, least = other, left
-    still = ground.believe.still
-    return replace(best, moved={k: c for k, c in best.moved.items() if _noticeable(best.olds[k], c, still)})
-
-
 @dataclass(frozen=True)
-class _Wholes:
-    """The things that outlines are pieces of, looked for once."""
+class Search:
+    """What is tried beside a hypothesis, and what was found out while trying."""
 
     ground: Ground
-    known: dict[int, tuple[Old, Old | None]] = field(default_factory=dict)
-    """by the piece's identity, which it keeps for as long as it is here"""
+    changed: Sequence[Changed]
+    first: dict[int, Old] = field(default_factory=dict)
+    """the objects as they were outlined at first"""
+    fits: dict[int, list[Fit]] = field(default_factory=lambda: defaultdict(list))
+    """where each was found at any time"""
+    wholes: Kept[Old | None] = field(default_factory=Kept)
+    """the thing that an outline is a piece of"""
+    slides: Kept[Fit | None] = field(default_factory=Kept)
+    """how an object may have slid"""
+    outlined: Kept[Old | None] = field(default_factory=Kept)
+    """what went along with an object, by its motion"""
+    anew: dict[int, Old] = field(default_factory=dict)
+    """what was outlined so, by its identity"""
 
-    def of(self, pieces: dict[int, Old]) -> list[tuple[int, Old]]:
+    def settle(self, olds: Sequence[Old], begun: Settled | None = None) -> Settled:
+        """Find each old object's new place or that it left, and what else arrived.
+
+        ``begun``: what was settled before these objects were known.
+        """
+        best, least = judged(self.ground, self._placed(olds, begun or Settled()))
+        again = True
+        while again:
+            again = False
+            for tries, goes_on in (
+                *((partial(self._elsewhere, k=k), True) for k in list(self.fits)),
+                *((partial(self._stayed, k=k), True) for k in (*best.moved, *best.removed)),
+                *((partial(self._outlines, k=k), False) for k in (*best.moved, *best.removed)),
+                *((partial(self._slides, k=k, one=one), True) for k, one in self._asked(best)),
+            ):
+                for other in tries(best):
+                    other, left = judged(self.ground, other)
+                    if left < least - 1:  # pixel
+                        again |= goes_on
+                        best, least = other, left
+                        break
+        still = self.ground.believe.still
+        return replace(best, moved={k: c for k, c in best.moved.items() if _noticeable(best.olds[k], c, still)})
+
+    def _placed(self, olds: Sequence[Old], begun: Settled) -> Settled:
+        """The hypothesis that more objects are where each is found by itself, one after the other."""
+        ground, changed = self.ground, self.changed
+        more = dict(enumerate(olds, start=len(begun.olds)))
+        known = dict(enumerate(begun.olds)) | more
+        self.first.update(more)
+        asked = {k: old for k, old in more.items() if may_have_changed(ground, changed, old)}
+        kept = {k: known[k] for k in (*begun.moved, *begun.removed) if not _piece(known[k], olds)}
+        moved = {k: c for k, c in begun.moved.items() if k in kept}
+        moved, placed = place_all(ground, (kept, asked), changed, moved, (count(len(known)), self.fits))
+        touched = [k for k in begun.touched if not _piece(known[k], olds)] + [k for k in placed if k not in kept]
+        return _completed(ground, known | placed, touched, changed, moved)
+
+    def _with(self, best: Settled, k: int, old: Old, change: PoseChange | None) -> Settled:
+        """The hypothesis with object ``k`` as it is told here, without those that are pieces of it."""
+        apart = [j for j in best.touched if j != k and not best.olds[j].within(old)]
+        others = {j: c for j, c in best.moved.items() if j in apart}
+        moved = others if change is None else others | {k: change}
+        return _completed(self.ground, dict(enumerate(best.olds)) | {k: old}, [k, *apart], self.changed, moved)
+
+    def _without(self, best: Settled, k: int, one: Old) -> tuple[list[Old], list[Past]]:
+        """What left in a hypothesis, with ``one`` for object ``k``, and the photos past that, the others taken off."""
+        apart = [j for j in best.touched if j != k and not best.olds[j].within(one)]
+        gone = [one, *(best.olds[j] for j in apart if j in best.moved or j in best.removed)]
+        placed = [(best.olds[j], c) for j, c in best.moved.items() if j in apart]
+        return gone, without(self.ground, self.changed, gone, placed)
+
+    def _outlines(self, best: Settled, k: int) -> Iterator[Settled]:
+        """With an object outlined by its motion; the rest may be a thing that left."""
+        old, change = best.olds[k], best.moved.get(k)
+        other = (
+            None
+            if id(old) in self.anew or k not in {*best.moved, *best.removed}
+            else self._outlined(best, k, old, change)
+        )
+        if other is None:
+            return
+        self.anew[id(other)] = other
+        if change is not None:
+            change = self._refined(best, k, other, change)
+        if change is not None or k in best.removed:
+            rest = rest_of(self.ground, old, other)
+            if rest is not None and may_have_changed(self.ground, self.changed, rest):
+                n = len(best.olds)
+                yield self._with(replace(best, olds=(*best.olds, rest), touched=(*best.touched, n)), k, other, change)
+            yield self._with(best, k, other, change)
+
+    def _outlined(self, best: Settled, k: int, old: Old, change: PoseChange | None) -> Old | None:
+        """All that went along with an object."""
+        if old.remembered:
+            return None
+        pose = None if change is None else change.new_from_old
+        return self.outlined.get(
+            (old, change), lambda: with_comoving(self.ground, old, self._without(best, k, old)[1], pose)
+        )
+
+    def _refined(self, best: Settled, k: int, old: Old, change: PoseChange) -> PoseChange | None:
+        """An object's pose in the photos of a hypothesis; None if they do not show it there."""
+        gone, views = self._without(best, k, old)
+        found = refine(Sight(self.ground.field, old, views, gone), change.new_from_old, self.ground.fine, FINER)
+        return found if found is not None and believed(self.ground, old, views, found) else None
+
+    def _elsewhere(self, best: Settled, k: int) -> Iterator[Settled]:
+        """With an object at another place at which it was found at any time."""
+        for fit in self.fits[k]:
+            if k not in best.moved or not _alike(best.moved[k], fit.change, fit.old):
+                change = self._refined(best, k, fit.old, fit.change)
+                if change is not None:
+                    yield self._with(best, k, fit.old, change)
+
+    def _stayed(self, best: Settled, k: int) -> Iterator[Settled]:
+        """With an object less that moved, as it was outlined at first, or as all that changed with it; or as if it had
+        not changed at all."""
+        first = self.first.get(k, best.olds[k])
+        for one in (first, self._outlined(best, k, first, None)) if k in best.moved else ():
+            if one is not None:
+                yield self._less(best, k, one, [k])
+        if k in best.moved or k in best.removed:
+            yield self._less(best, k, first, [])
+
+    def _less(self, best: Settled, k: int, one: Old, more: list[int]) -> Settled:
+        """The hypothesis that object ``k``, outlined as ``one``, did not move; ``more`` than that may have left."""
+        rests = [j for j in best.touched if j not in self.first and j != k and best.olds[j].within(one)]
+        touched = [*more, *(j for j in best.touched if j not in rests and j != k)]
+        others = {j: c for j, c in best.moved.items() if j != k and j in touched}
+        return _completed(self.ground, dict(enumerate(best.olds)) | {k: one}, touched, self.changed, others)
+
+    def _asked(self, best: Settled) -> list[tuple[int, Old]]:
+        """What may have slid about where it was, by less than its width.
+
+        Those are not looked for before: what seems to have arrived is where they were, and most of them to have stayed.
+        """
+        if not best.arrived and (best.moved or best.removed):
+            return []
+        came = [_box(self.ground.hull.lattice, part) for part in best.arrived]
+        olds = {k: old for k, old in enumerate(best.olds) if k not in best.removed}
+        some = {k: old for k, old in olds.items() if _beside(_box(old.lattice, old.voxels), came)}
+        return [(k, one) for k, old in some.items() for one in (old, old.instead) if one is not None] + self._whole(
+            some
+        )
+
+    def _slides(self, best: Settled, k: int, one: Old) -> Iterator[Settled]:
+        """With an object that slid."""
+
+        def found() -> Fit | None:
+            gone, views = self._without(best, k, one)
+            return slid(self.ground, one, gone, views)
+
+        fit = self.slides.get((one,), found)
+        if fit is not None and _noticeable(fit.old, fit.change, self.ground.believe.still):
+            yield self._with(best, k, fit.old, fit.change)
+
+    def _whole(self, pieces: dict[int, Old]) -> list[tuple[int, Old]]:
         """The whole things, where they stand free, each once, by one of its pieces."""
-        out: list[tuple[int, Old]] = []
+        g, out = self.ground, list[tuple[int, Old]]()
         for k, piece in pieces.items():
             if piece.remembered or any(piece.within(whole) for _, whole in out):
                 continue
-            if id(piece) not in self.known:
-                g = self.ground
-                self.known[id(piece)] = piece, standing(g.field, g.photographed, piece, g.planes, g.shape)
-            whole = self.known[id(piece)][1]
+            whole = self.wholes.get((piece,), partial(standing, g.field, g.photographed, piece, g.planes, g.shape))
             out += [(k, whole)] if whole is not None else []
         return out
-
-
-def _exchanges(
-    ground: Ground, first: Sequence[Old], changed: Sequence[Changed], best: Settled, wholes: _Wholes
-) -> Iterator[Settled]:
-    """The hypothesis with one object less that moved, as it was outlined at ``first``, or with one that slid."""
-    olds = dict(enumerate(best.olds))
-    for k in best.moved:
-        whole = {k: first[k]} if k < len(first) else {}
-        rests = [j for j in best.touched if j >= len(first) and j != k and whole and olds[j].within(first[k])]
-        touched = [j for j in best.touched if j not in rests]
-        others = {j: c for j, c in best.moved.items() if j != k and j in touched}
-        yield _completed(ground, olds | whole, touched, changed, others)
-    if best.arrived or not (best.moved or best.removed):
-        yield from _slides(ground, changed, best, wholes)
-
-
-def _slides(ground: Ground, changed: Sequence[Changed], best: Settled, wholes: _Wholes) -> Iterator[Settled]:
-    """The hypothesis with one object that slid about where it was, by less than its width.
-
-    Those are not looked for before: what seems to have arrived is where they were, and most of them to have stayed.
-    """
-    olds = dict(enumerate(best.olds))
-    came = [_box(ground.hull.lattice, part) for part in best.arrived]
-    some = {k: old for k, old in olds.items() if k not in best.removed and _beside(_box(old.lattice, old.voxels), came)}
-    asked = [(k, one) for k, old in some.items() for one in (old, old.instead) if one is not None]
-    for k, one in [*asked, *wholes.of(some)]:
-        apart = [j for j in best.touched if j != k and not olds[j].within(one)]
-        others = {j: c for j, c in best.moved.items() if j in apart}
-        gone = [one, *(olds[j] for j in apart if j in best.moved or j in best.removed)]
-        views = without(ground, changed, gone, [(olds[j], c) for j, c in others.items()])
-        fit = slid(ground, one, gone, views)
-        if fit is not None and _noticeable(fit.old, fit.change, ground.believe.still):
-            yield _completed(ground, olds | {k: fit.old}, [k, *apart], changed, others | {k: fit.change})
 
 
 def _box(lattice: Lattice, voxels: Voxels) -> Array:
@@ -158,6 +257,18 @@ def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
     if changed_share(changed, old) < ground.believe.touched:
         return False
     return left_by(ground, without(ground, changed, [old]), old) is not None
+
+
+def _piece(old: Old, others: Sequence[Old]) -> bool:
+    """Whether an object is a mere piece of a larger one."""
+    return any(old.volume < o.volume and old.within(o) for o in others)
+
+
+def _alike(one: PoseChange, other: PoseChange, old: Old) -> bool:
+    """Whether two poses put an object at the same place, within a pixel or two."""
+    points = torch.from_numpy(old.cloud.points).double()
+    apart = (transform(one.new_from_old, points) - transform(other.new_from_old, points)).norm(dim=-1)
+    return bool(apart.max() < 2 * one.pixel)
 
 
 def _noticeable(old: Old, change: PoseChange, still: float) -> bool:

@@ -26,14 +26,14 @@ def halves(old: Old, config: ObjectConfig) -> list[tuple[Old, Old]]:
     """Each side of the best cut through an object, with the other; none if one of them could not be found again."""
     if len(old.cloud.points) < 2 * FEWEST_POINTS:
         return []
-    side = _best_cut(_alike(old.cloud))
+    side = _best_cut(alike(old.cloud))
     nearest = cKDTree(old.cloud.points).query(old.lattice.centres[old.voxels])[1]
     one, other = (restricted(old, some_of(old.voxels, mine[nearest]), config) for mine in (side, ~side))
     enough = min(len(o.cloud.points) for o in (one, other)) >= FEWEST_POINTS
     return [(one, other), (other, one)] if enough else []
 
 
-def _alike(cloud: Cloud) -> csc_matrix:
+def alike(cloud: Cloud) -> csc_matrix:
     """(N, N) how alike neighbouring points are: near, alike in colour and not across a hollow, each beside what
     is usual on this surface."""
     count = len(cloud.points)
