@@ -8,7 +8,7 @@ import torch
 
 from refield.estimate import recipe, settle
 from refield.estimate.lattice import grown
-from refield.estimate.likelihood import Settled, unexplained_by
+from refield.estimate.likelihood import Settled, judged
 from refield.scene.pose import angle_between, transform
 from tests.estimate.boxes import BoxWorld, capture_of, new_photos, standing, turn
 
@@ -55,14 +55,37 @@ def test_the_truth_leaves_less_unexplained_than_any_other_hypothesis(capture, tm
         views = tuple(settle.without(ground, changed, [old]))
         return replace(found, moved={}, removed={k: 1.0}, arrived=(there,), views=views)
 
-    least = unexplained_by(ground, found)
+    def left_by(hypothesis: Settled) -> float:
+        return judged(ground, hypothesis)[1]
+
+    least = left_by(found)
     pixels = int(sum(p.changed.mask.sum() for p in found.views) + sum(p.covered.sum() for p in found.views))
     turned = turn(transform(AWAY, CENTRE), 25, (0, 0, 0)) @ AWAY
     nothing = replace(found, moved={}, views=tuple(settle.without(ground, changed, [])))
-    left = replace(found, moved={}, removed={k: 1.0}, views=came().views)
-    for other in (put(turned), put(turn(CENTRE, 0, (0.05, 0, 0)) @ AWAY), came(), left, nothing):
-        assert unexplained_by(ground, other) > least + 0.05 * pixels
-    assert unexplained_by(ground, came()) < unexplained_by(ground, left) < unexplained_by(ground, nothing)
+    gone = replace(found, moved={}, removed={k: 1.0}, views=came().views)
+    for other in (put(turned), put(turn(CENTRE, 0, (0.05, 0, 0)) @ AWAY), came(), gone, nothing):
+        assert left_by(other) > least + 0.05 * pixels
+    assert left_by(came()) < left_by(gone) < left_by(nothing)
+
+
+def test_a_newcomer_that_explains_nothing_is_taken_back(capture, tmp_path, monkeypatch):
+    """What the photos show as it was is dear to call new; what they show of a newcomer is cheap."""
+    _, (ground, _olds, _changed, found) = settled(capture, tmp_path, monkeypatch)
+    lattice = ground.hull.lattice
+    low, high = lattice.centres.reshape(-1, 3).min(0), lattice.centres.reshape(-1, 3).max(0)
+    corner = (lattice.centres < low + 0.15 * (high - low)).all(-1)
+    bare = replace(found, moved={}, removed={})
+    kept, left = judged(ground, replace(bare, arrived=(corner,)))
+    assert kept.arrived == () and left == judged(ground, bare)[1]
+
+
+def test_settling_more_keeps_what_was_settled(capture, tmp_path, monkeypatch):
+    _, (ground, olds, changed, found) = settled(capture, tmp_path, monkeypatch)
+    search = settle.Search(ground, changed)
+    begun = search.settle(olds)
+    again = search.settle([], begun)
+    assert set(again.moved) == set(begun.moved) == set(found.moved)
+    assert len(again.olds) == len(begun.olds) and len(set(again.touched)) == len(again.touched)
 
 
 def test_what_slid_by_less_than_its_width_is_found_where_it_hid(tmp_path, monkeypatch):

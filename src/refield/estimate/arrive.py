@@ -14,7 +14,7 @@ from refield.estimate.ground import Ground
 from refield.estimate.hull import votes
 from refield.estimate.lattice import Lattice, Voxels, components, grown
 from refield.estimate.light import Ratio
-from refield.estimate.look import View
+from refield.estimate.look import Array, View
 from refield.estimate.objects import Old
 from refield.estimate.past import Past
 from refield.scene.pose import invert, transform
@@ -106,10 +106,12 @@ def fresh(past: Sequence[Past], lattice: Lattice, part: Voxels) -> float:
     return float(np.median(shares)) if shares else 0.0
 
 
-def shadow_of(view: View, lattice: Lattice, voxels: Voxels) -> Mask:
-    """Pixels that voxels project to."""
+def shadow_of(view: View, lattice: Lattice, voxels: Voxels, depth: Array | None = None) -> Mask:
+    """Pixels that voxels project to; with the ``depth`` (H, W) of what stands there, those that it does not hide."""
     out = np.zeros(view.shape, bool)
-    uv, _, inside = view.project(lattice.centres[voxels])
+    uv, distance, inside = view.project(lattice.centres[voxels])
+    if depth is not None:
+        inside = inside & (distance < view.lookup(depth, uv, inside) + lattice.cell)
     ij = uv[inside].astype(np.int64)
     out[ij[:, 1], ij[:, 0]] = True
     return pixels.close(out, 5)

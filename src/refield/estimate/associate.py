@@ -16,7 +16,7 @@ from torch import Tensor
 
 from refield.estimate.arrive import arrivals, newcomers, remarkable
 from refield.estimate.detect import Changed
-from refield.estimate.fit import Fit, fit_again, fit_of, left_by
+from refield.estimate.fit import Fit, at_one_place, fit_again, fit_of, left_by
 from refield.estimate.ground import Ground
 from refield.estimate.matched import matched_poses
 from refield.estimate.objects import Old
@@ -68,7 +68,7 @@ def place_all(
     sure = [k for k, old in asked.items() if left_by(ground, without(ground, changed, [old]), old) is not None]
     others = [k for k in asked if k not in sure]
     for out, some in [(sure, sure), (list(asked), others)] if sure and others else [(list(asked), list(asked))]:
-        gone = {k: known[k] for k in (*there, *out)}
+        gone = {k: known[k] for k in dict.fromkeys((*there, *out, *moved))}
         views = without(ground, changed, list(gone.values()), [(known[k], c) for k, c in moved.items()])
         more, placed = _place(ground, gone, some, views, kept)
         moved, known = moved | more, known | placed
@@ -103,8 +103,9 @@ def _place(
             }
             enough = {k: ground.believe.shown if k in cut else 0.0 for k in some}
             fits |= {k: fit for k, fit in tries.items() if fit is not None and fit.change.explained >= enough[k]}
-            for k, fit in fits.items():
-                found[k].append(fit)
+            for k, fit in tries.items():
+                if fit is not None and not any(at_one_place(f.change, fit.change, fit.old) for f in found[k]):
+                    found[k].append(fit)
             if any(fit.change.explained >= ground.believe.shown for fit in fits.values()):
                 break
         if not fits:

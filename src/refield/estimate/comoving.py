@@ -56,11 +56,15 @@ class _Asked:
     """(N,) what it costs if it went along"""
 
 
-def with_comoving(ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor | None) -> Old | None:
+def with_comoving(
+    ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor | None, others: Sequence[Old] = ()
+) -> Old | None:
     """The object as all that went along with it from where it was; None if next to nothing did.
 
-    ``past``: the new photos, without what left and with what was placed before taken off. ``new_from_old``: None if it
-    left.
+    Args:
+        past: the new photos, without what left and with what was placed before taken off.
+        new_from_old: the pose change (4, 4); None if it left.
+        others: what has a change of its own, and is no part of it.
     """
     places = old.lattice.centres[old.voxels]
     low, high = places.min(0), places.max(0)
@@ -80,6 +84,8 @@ def with_comoving(ground: Ground, old: Old, past: Sequence[Past], new_from_old: 
     nearest = cKDTree(cloud.points).query(lattice.centres[solid])[1]
     voxels = np.zeros_like(solid)
     voxels[solid] = likely[nearest] > 0.5
+    for other in others:
+        voxels &= ~other.lattice.holds(other.voxels, lattice.centres)
     before = old.lattice.holds(old.voxels, lattice.centres)
     parts = [p for p in components(voxels, FEWEST_POINTS) if (p & before).any()]
     if not parts:
@@ -159,9 +165,11 @@ class _Shown:
     def of(ground: Ground, old: Old, p: Past, pose: Tensor | None) -> _Shown:
         view = p.view
         depth = np.full(view.shape, np.inf, np.float32)
+        front = np.minimum(p.beyond, np.where(p.covered, p.depth, np.inf))
         if pose is not None:
             seen = object_alone(ground.field, old, view.rays, pose)
             depth = np.where(seen.opacity.numpy() > 0.5, seen.depth.numpy(), np.inf).reshape(view.shape)
+            depth = np.where(depth < front * (1 + 2 * view.pixel_angle), depth, np.inf)
         wrong = LIMIT * p.changed.threshold
         before = np.where(p.changed.light, 0, np.minimum((p.changed.difference / wrong) ** 2, 1))
         even = Ratio.of(view, view.rgb, ground.detect).even_and_grey
@@ -169,7 +177,6 @@ class _Shown:
         behind = np.where(p.known, np.minimum((p.difference / wrong) ** 2, 1), _UNKNOWN)
         behind = np.where(p.changed.new, _UNKNOWN, behind)
         sigma = blur_sigma(view, ground.detect)
-        front = np.minimum(p.beyond, np.where(p.covered, p.depth, np.inf))
         return _Shown(p, pixels.to_lab(pixels.blur(view.photo, sigma)), depth, front, before, behind, sigma)
 
     def where_it_was(self, cloud: Cloud, covered: Array) -> tuple[Array, Array]:

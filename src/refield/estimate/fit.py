@@ -70,10 +70,10 @@ def fit_of(
     whole = max(fits, key=lambda f: f.change.explained, default=None)
     if old.remembered:
         return whole
-    if whole is not None:
-        along = _along(ground, whole, olds, past)
-        return along if along is not None and along.change.net > whole.change.net else whole
-    return _part_of(ground, outlines[-1], olds, past, newcomers_left, extra) if newcomers_left else None
+    part = None if whole is None else _along(ground, whole, olds, past)
+    if part is None and newcomers_left:
+        part = _part_of(ground, outlines[-1], olds, past, newcomers_left, extra)
+    return whole if part is None or (whole is not None and whole.change.net >= part.change.net) else part
 
 
 def _along(ground: Ground, fit: Fit, olds: Sequence[Old], past: Sequence[Past]) -> Fit | None:
@@ -90,16 +90,25 @@ def _along(ground: Ground, fit: Fit, olds: Sequence[Old], past: Sequence[Past]) 
 def rest_of(ground: Ground, old: Old, part: Old) -> Old | None:
     """What an outline holds beside a thing; None if that could not be found again."""
     left = components(old.voxels & ~part.lattice.holds(part.voxels, old.lattice.centres), FEWEST_POINTS)
-    rest = restricted(old, left[0], ground.shape) if left else None
+    rest = restricted(replace(old, instead=None), left[0], ground.shape) if left else None
     return rest if rest is not None and len(rest.cloud.points) >= FEWEST_POINTS else None
 
 
 def fit_again(ground: Ground, olds: Sequence[Old], past: Sequence[Past], found: Sequence[Fit]) -> Fit | None:
     """The best of the places at which an object was found before, if the photos still show it there for certain."""
-    gains = ground.believe.gains
-    again = [_refined(ground, f.old, olds, past, [f.change.new_from_old], f.score, gains) for f in found]
-    best = max((f for f in again if f is not None), key=lambda f: f.change.explained, default=None)
+    again: list[Fit] = []
+    for f in found:
+        fit = _refined(ground, f.old, olds, past, [f.change.new_from_old], f.score, ground.believe.gains)
+        again += [replace(fit, rest=f.rest)] if fit is not None else []
+    best = max(again, key=lambda f: f.change.explained, default=None)
     return best if best is not None and best.change.explained >= ground.believe.shown else None
+
+
+def at_one_place(one: PoseChange, other: PoseChange, old: Old) -> bool:
+    """Whether two poses put an object at the same place, within a pixel or two."""
+    points = torch.from_numpy(old.cloud.points).double()
+    apart = (transform(one.new_from_old, points) - transform(other.new_from_old, points)).norm(dim=-1)
+    return bool(apart.max() < 2 * one.pixel)
 
 
 def _part_of(
@@ -217,12 +226,16 @@ def believed(ground: Ground, old: Old, past: Sequence[Past], change: PoseChange,
     ``gains``: the part of its pixels by which they must show more of it than of what was there.
     """
     believe = ground.believe
-    gains = believe.gains if gains is None else gains
     least = believe.explains * min(1.0, max(0.5, shown_right(ground, old, past) / believe.shown))
-    gains *= 2 if change.before > believe.alike else 1
     if is_sunk(ground, old, change):  # possible, off the edge of a table; but a crumb of floor fits anywhere
         least = max(least, believe.sunk)
-    return change.explained >= max(least, change.before + gains)
+    return change.explained >= least and gains_enough(ground, change, gains)
+
+
+def gains_enough(ground: Ground, change: PoseChange, gains: float | None = None) -> bool:
+    """Whether the photos show that much more of an object than of what was there; ``gains`` as configured if None."""
+    gains = ground.believe.gains if gains is None else gains
+    return change.explained >= change.before + gains * (2 if change.before > ground.believe.alike else 1)
 
 
 def _detail(ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor) -> Detail | None:

@@ -93,6 +93,7 @@ class Ground:
 
     def past(self, changed: Sequence[Changed], olds: Sequence[Old]) -> list[Past]:
         """The photos past some objects."""
+        olds = sorted(olds, key=id)  # whichever is named first
         return self.pasts.get(
             (*changed, *olds),
             lambda: look_past(self.field, changed, self.memory, olds, (self.detect, self.carving)),

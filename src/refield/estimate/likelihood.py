@@ -7,7 +7,6 @@ nobody knows what is behind, costs less than what is wrong, and more than what i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -48,38 +47,28 @@ class Settled:
     """indices of those that may have moved or left"""
 
 
-def unexplained_by(ground: Ground, settled: Settled) -> float:
-    """Pixels, over all new photos, that a hypothesis does not explain, and what its bodies cost."""
-    left = [_left(ground, settled, p) for p in settled.views]
-    return _total(ground, settled, [np.where(_came(ground, settled, p), _CAME, e) for p, e in zip(settled.views, left)])
-
-
 def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
-    """The hypothesis without newcomers that explain no more than they cost, and what it leaves unexplained."""
-    left = [_left(ground, settled, p) for p in settled.views]
+    """The hypothesis without newcomers that explain no more than they cost; and the pixels, over all new photos, that
+    it does not explain, with what its bodies cost.
+
+    A newcomer is asked for where a photo shows it and what it stands before is known.
+    """
+    found = [_left(ground, settled, p) for p in settled.views]
+    left, tells = [e for e, _ in found], [t for _, t in found]
     arrived = []
     for part in settled.arrived:
-        shown = [shadow_of(p.view, ground.hull.lattice, part) for p in settled.views]
+        shown = [shadow_of(p.view, ground.hull.lattice, part, p.depth) & t for p, t in zip(settled.views, tells)]
         if sum(float((e[here] - _CAME).sum()) for here, e in zip(shown, left)) > 0:
             arrived.append(part)
             left = [np.where(here, _CAME, e) for here, e in zip(shown, left)]
-    settled = replace(settled, arrived=tuple(arrived))
-    return settled, _total(ground, settled, left)
-
-
-def _total(ground: Ground, settled: Settled, left: Sequence[Array]) -> float:
     body = _BODY * ground.believe.smallest * float(np.mean([e.size for e in left] or [0]))
-    return (2 * len(settled.moved) + len(settled.removed)) * body + sum(float(e.sum()) for e in left)
+    bodies = 2 * len(settled.moved) + len(settled.removed)
+    return replace(settled, arrived=tuple(arrived)), bodies * body + sum(float(e.sum()) for e in left)
 
 
-def _came(ground: Ground, settled: Settled, p: Past) -> NDArray[np.bool_]:
-    """Pixels (H, W) of a photo that show what arrived."""
-    shown = [shadow_of(p.view, ground.hull.lattice, part) for part in settled.arrived]
-    return np.logical_or.reduce([np.zeros(p.view.shape, bool), *shown])
-
-
-def _left(ground: Ground, settled: Settled, p: Past) -> Array:
-    """(H, W) in [0, 1], what is left unexplained of each pixel of a photo, but for what arrived."""
+def _left(ground: Ground, settled: Settled, p: Past) -> tuple[Array, NDArray[np.bool_]]:
+    """(H, W) in [0, 1], what is left unexplained of each pixel of a photo, but for what arrived; and the pixels
+    of which it is known what they show without that."""
     picture, anything = p.rgb, p.was & ~p.known
     depth, moved = p.beyond, np.zeros(p.view.shape, bool)
     for k, change in settled.moved.items():
@@ -88,8 +77,9 @@ def _left(ground: Ground, settled: Settled, p: Past) -> Array:
     apart = difference(p.view, picture, ground.detect)
     wrong = LIMIT * p.changed.threshold * np.where(moved, LIMIT, 1)  # never seen in this light, nor by these cameras
     left = np.minimum((apart / wrong) ** 2, 1)
-    left = np.where(p.changed.new | (p.changed.light & ~p.was), 0, left)
-    return np.asarray(np.where(anything, _UNKNOWN, left), np.float32)
+    told = ~p.changed.new & ~(p.changed.light & ~p.was)
+    left = np.where(anything, _UNKNOWN, np.where(told, left, 0)).astype(np.float32)
+    return left, told & ~anything
 
 
 def _before(

@@ -30,7 +30,7 @@ from refield.estimate.paper.route import estimate_change_paper
 from refield.estimate.place import PlaceConfig, place
 from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
-from refield.estimate.settle import Search, looks_gone, unexplained
+from refield.estimate.settle import Search, is_piece, looks_gone, unexplained
 from refield.field.radiance import Field, check_field
 from refield.field.source import Known
 from refield.scene.capture import Capture, Frame, check_capture, check_frames
@@ -151,9 +151,10 @@ def estimate_change(
     )  # fmt: skip
     search = Search(ground, scene.changed)
     settled = search.settle(olds)
-    more = _overlooked(scene, ground, settled, parts, olds) if parts.things else []
+    told = [*olds, *(settled.olds[k] for k in (*settled.moved, *settled.removed))]
+    more = _overlooked(scene, ground, settled, parts, told) if parts.things else []
     if more:
-        settled = search.settle(_whole(more), settled)
+        settled = search.settle([o for o in more if not is_piece(o, [*told, *more])], settled)
     say("segment")
     answer = concluded(Told(field, capture.train, scene.changed, photos, carved, scene.errors), settled)
     return replace(answer, why=answer.why + _never_seen(scene.changed))
@@ -288,11 +289,6 @@ def _were_there(
         if old is not None:
             found.append(old)
     return found
-
-
-def _whole(olds: list[Old]) -> list[Old]:
-    """Objects that are not mere pieces of others."""
-    return [o for o in olds if not any(k.volume > o.volume and o.within(k) for k in olds)]
 
 
 def _overlooked(scene: _Scene, ground: Ground, settled: Settled, parts: Parts, known: list[Old]) -> list[Old]:

@@ -19,7 +19,7 @@ from refield.estimate.associate import may_have_changed, place_all, places_of, w
 from refield.estimate.comoving import with_comoving
 from refield.estimate.consist import consistent
 from refield.estimate.detect import Changed
-from refield.estimate.fit import Fit, believed, left_by, rest_of, slid
+from refield.estimate.fit import Fit, at_one_place, believed, gains_enough, left_by, rest_of, slid
 from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
 from refield.estimate.lattice import Lattice, Voxels
@@ -62,18 +62,16 @@ class Search:
         again = True
         while again:
             again = False
-            for tries, goes_on in (
-                *((partial(self._elsewhere, k=k), True) for k in list(self.fits)),
-                *((partial(self._stayed, k=k), True) for k in (*best.moved, *best.removed)),
-                *((partial(self._outlines, k=k), False) for k in (*best.moved, *best.removed)),
-                *((partial(self._slides, k=k, one=one), True) for k, one in self._asked(best)),
+            for tries in (
+                *(partial(self._elsewhere, k=k) for k in list(self.fits)),
+                *(partial(self._stayed, k=k) for k in (*best.moved, *best.removed)),
+                *(partial(self._outlines, k=k) for k in (*best.moved, *best.removed)),
+                *(partial(self._slides, k=k, one=one) for k, one in self._asked(best)),
             ):
-                for other in tries(best):
-                    other, left = judged(self.ground, other)
-                    if left < least - 1:  # pixel
-                        again |= goes_on
-                        best, least = other, left
-                        break
+                others = [judged(self.ground, other) for other in tries(best)]
+                other, left = min(others, key=lambda o: o[1], default=(best, least))
+                if left < least - 1:  # pixel
+                    again, best, least = True, other, left
         still = self.ground.believe.still
         return replace(best, moved={k: c for k, c in best.moved.items() if _noticeable(best.olds[k], c, still)})
 
@@ -84,18 +82,33 @@ class Search:
         known = dict(enumerate(begun.olds)) | more
         self.first.update(more)
         asked = {k: old for k, old in more.items() if may_have_changed(ground, changed, old)}
-        kept = {k: known[k] for k in (*begun.moved, *begun.removed) if not _piece(known[k], olds)}
+        wholes = list(asked.values())
+        kept = {k: known[k] for k in (*begun.moved, *begun.removed) if not is_piece(known[k], wholes)}
         moved = {k: c for k, c in begun.moved.items() if k in kept}
         moved, placed = place_all(ground, (kept, asked), changed, moved, (count(len(known)), self.fits))
-        touched = [k for k in begun.touched if not _piece(known[k], olds)] + [k for k in placed if k not in kept]
+        touched = [k for k in begun.touched if not is_piece(known[k], wholes)]
+        touched += [k for k in placed if k not in touched]
         return _completed(ground, known | placed, touched, changed, moved)
 
-    def _with(self, best: Settled, k: int, old: Old, change: PoseChange | None) -> Settled:
-        """The hypothesis with object ``k`` as it is told here, without those that are pieces of it."""
-        apart = [j for j in best.touched if j != k and not best.olds[j].within(old)]
-        others = {j: c for j, c in best.moved.items() if j in apart}
-        moved = others if change is None else others | {k: change}
-        return _completed(self.ground, dict(enumerate(best.olds)) | {k: old}, [k, *apart], self.changed, moved)
+    def _with(self, best: Settled, k: int, old: Old, change: PoseChange | None, rest: Old | None = None) -> Settled:
+        """The hypothesis with object ``k`` as it is told here, without those that are pieces of it, and the others
+        without it; the ``rest`` of its outline may have left."""
+        olds, apart = dict(enumerate(best.olds)) | {k: old}, [k]
+        for j in best.touched:
+            mine = olds[j]
+            if j == k or mine.within(old):
+                continue
+            if old.within(mine):
+                left = rest_of(self.ground, mine, old)
+                if left is None:
+                    continue
+                olds[j] = left
+            apart.append(j)
+        if rest is not None and may_have_changed(self.ground, self.changed, rest):
+            apart.append(len(olds))
+            olds[len(olds)] = rest
+        moved = {j: c for j, c in best.moved.items() if j in apart and j != k}
+        return _completed(self.ground, olds, apart, self.changed, moved if change is None else moved | {k: change})
 
     def _without(self, best: Settled, k: int, one: Old) -> tuple[list[Old], list[Past]]:
         """What left in a hypothesis, with ``one`` for object ``k``, and the photos past that, the others taken off."""
@@ -119,33 +132,34 @@ class Search:
             change = self._refined(best, k, other, change)
         if change is not None or k in best.removed:
             rest = rest_of(self.ground, old, other)
-            if rest is not None and may_have_changed(self.ground, self.changed, rest):
-                n = len(best.olds)
-                yield self._with(replace(best, olds=(*best.olds, rest), touched=(*best.touched, n)), k, other, change)
-            yield self._with(best, k, other, change)
+            for one in (rest, None) if rest is not None else (None,):
+                yield self._with(best, k, other, change, one)
 
     def _outlined(self, best: Settled, k: int, old: Old, change: PoseChange | None) -> Old | None:
         """All that went along with an object."""
         if old.remembered:
             return None
-        pose = None if change is None else change.new_from_old
-        return self.outlined.get(
-            (old, change), lambda: with_comoving(self.ground, old, self._without(best, k, old)[1], pose)
-        )
+        return self.outlined.get((old, change), partial(self._comoving, best, k, old, change))
+
+    def _comoving(self, best: Settled, k: int, old: Old, change: PoseChange | None) -> Old | None:
+        gone, views = self._without(best, k, old)
+        others = [o for o in gone if o is not old and not old.within(o)]
+        return with_comoving(self.ground, old, views, None if change is None else change.new_from_old, others)
 
     def _refined(self, best: Settled, k: int, old: Old, change: PoseChange) -> PoseChange | None:
         """An object's pose in the photos of a hypothesis; None if they do not show it there."""
         gone, views = self._without(best, k, old)
         found = refine(Sight(self.ground.field, old, views, gone), change.new_from_old, self.ground.fine, FINER)
-        return found if found is not None and believed(self.ground, old, views, found) else None
+        gains = self.ground.believe.gains if gains_enough(self.ground, change) else 0.0  # what slid looks as before
+        return found if found is not None and believed(self.ground, old, views, found, gains) else None
 
     def _elsewhere(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object at another place at which it was found at any time."""
         for fit in self.fits[k]:
-            if k not in best.moved or not _alike(best.moved[k], fit.change, fit.old):
+            if k not in best.moved or not at_one_place(best.moved[k], fit.change, fit.old):
                 change = self._refined(best, k, fit.old, fit.change)
                 if change is not None:
-                    yield self._with(best, k, fit.old, change)
+                    yield self._with(best, k, fit.old, change, fit.rest)
 
     def _stayed(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object less that moved, as it was outlined at first, or as all that changed with it; or as if it had
@@ -159,7 +173,8 @@ class Search:
 
     def _less(self, best: Settled, k: int, one: Old, more: list[int]) -> Settled:
         """The hypothesis that object ``k``, outlined as ``one``, did not move; ``more`` than that may have left."""
-        rests = [j for j in best.touched if j not in self.first and j != k and best.olds[j].within(one)]
+        inside = [j for j in best.touched if j != k and best.olds[j].within(one)]
+        rests = [j for j in inside if more or j not in self.first]
         touched = [*more, *(j for j in best.touched if j not in rests and j != k)]
         others = {j: c for j, c in best.moved.items() if j != k and j in touched}
         return _completed(self.ground, dict(enumerate(best.olds)) | {k: one}, touched, self.changed, others)
@@ -187,7 +202,9 @@ class Search:
 
         fit = self.slides.get((one,), found)
         if fit is not None and _noticeable(fit.old, fit.change, self.ground.believe.still):
-            yield self._with(best, k, fit.old, fit.change)
+            change = self._refined(best, k, fit.old, fit.change)
+            if change is not None:
+                yield self._with(best, k, fit.old, change)
 
     def _whole(self, pieces: dict[int, Old]) -> list[tuple[int, Old]]:
         """The whole things, where they stand free, each once, by one of its pieces."""
@@ -259,16 +276,9 @@ def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
     return left_by(ground, without(ground, changed, [old]), old) is not None
 
 
-def _piece(old: Old, others: Sequence[Old]) -> bool:
+def is_piece(old: Old, others: Sequence[Old]) -> bool:
     """Whether an object is a mere piece of a larger one."""
     return any(old.volume < o.volume and old.within(o) for o in others)
-
-
-def _alike(one: PoseChange, other: PoseChange, old: Old) -> bool:
-    """Whether two poses put an object at the same place, within a pixel or two."""
-    points = torch.from_numpy(old.cloud.points).double()
-    apart = (transform(one.new_from_old, points) - transform(other.new_from_old, points)).norm(dim=-1)
-    return bool(apart.max() < 2 * one.pixel)
 
 
 def _noticeable(old: Old, change: PoseChange, still: float) -> bool:
