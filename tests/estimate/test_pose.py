@@ -94,13 +94,9 @@ def test_looking_past_it_heeds_how_near_to_a_surface_is_on_it(stage):
     """To one who takes everything for the same surface, nothing was taken off it."""
     told = {}
     for surface in (HullConfig().surface, 1e4):
-        ground = SimpleNamespace(
-            field=BEFORE,
-            memory=stage.scene.errors.memory,
-            detect=stage.scene.config.detect,
-            carving=HullConfig(surface=surface),
-            believe=AssociateConfig(),
-        )
+        carving, memory = HullConfig(surface=surface), stage.scene.errors.memory
+        past = look_past(BEFORE, stage.scene.changed, memory, [stage.old], (stage.scene.config.detect, carving))
+        ground = SimpleNamespace(past=lambda *_, past=past: past, believe=AssociateConfig())
         told[surface] = looks_gone(ground, stage.scene.changed, stage.old)
     assert list(told.values()) == [True, False]
 
@@ -229,7 +225,8 @@ def test_the_outline_of_a_moved_object_is_whole_in_photos_larger_than_the_workin
     small = recipe._detected(stage.capture, BEFORE, stage.frames, config, Models())
     past = look_past(BEFORE, small.changed, small.errors.memory, [stage.old], (config.detect, config.hull))
     found = refine(Sight(BEFORE, stage.old, past, [stage.old]), TRUE)
-    sight = Sight(BEFORE, stage.old, take_off(BEFORE, past, stage.old, found), [stage.old])
+    ground = SimpleNamespace(object_alone=lambda old, view, c: object_alone(BEFORE, old, view.rays, c.new_from_old))
+    sight = Sight(BEFORE, stage.old, take_off(ground, past, stage.old, found), [stage.old])
     masks = _shown_in(sight, found.new_from_old)
     assert len(masks) == 4
     for k, mask in masks.items():

@@ -70,10 +70,10 @@ def fit_of(
     whole = max(fits, key=lambda f: f.change.explained, default=None)
     if old.remembered:
         return whole
-    part = None if whole is None else _along(ground, whole, olds, past)
-    if part is None and newcomers_left:
-        part = _part_of(ground, outlines[-1], olds, past, newcomers_left, extra)
-    return whole if part is None or (whole is not None and whole.change.net >= part.change.net) else part
+    found = [] if whole is None else [whole, _along(ground, whole, olds, past)]
+    if newcomers_left and not any(fit is not None and fit.change.explained >= ground.believe.shown for fit in found):
+        found.append(_part_of(ground, outlines[-1], olds, past, newcomers_left, extra))
+    return max((fit for fit in found if fit is not None), key=lambda f: f.change.net, default=None)
 
 
 def _along(ground: Ground, fit: Fit, olds: Sequence[Old], past: Sequence[Past]) -> Fit | None:

@@ -86,9 +86,9 @@ class Ground:
     search: RegisterConfig
     fine: RefineConfig
     matcher: Matcher
-    pasts: Kept[list[Past]] = dataclasses.field(default_factory=lambda: Kept(24))
+    pasts: Kept[list[Past]] = dataclasses.field(init=False, default_factory=lambda: Kept(24))
     """the photos past some objects"""
-    alone: Kept[Seen] = dataclasses.field(default_factory=lambda: Kept(128))
+    alone: Kept[Seen] = dataclasses.field(init=False, default_factory=lambda: Kept(128))
     """a moved object's own picture in a photo"""
 
     def past(self, changed: Sequence[Changed], olds: Sequence[Old]) -> list[Past]:

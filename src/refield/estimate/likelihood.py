@@ -57,8 +57,8 @@ def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     left, tells = [e for e, _ in found], [t for _, t in found]
     arrived = []
     for part in settled.arrived:
-        shown = [shadow_of(p.view, ground.hull.lattice, part, p.depth) & t for p, t in zip(settled.views, tells)]
-        if sum(float((e[here] - _CAME).sum()) for here, e in zip(shown, left)) > 0:
+        shown = [shadow_of(p.view, ground.hull.lattice, part, p.depth) for p in settled.views]
+        if sum(float((e[here & t] - _CAME).sum()) for here, t, e in zip(shown, tells, left)) > 0:
             arrived.append(part)
             left = [np.where(here, _CAME, e) for here, e in zip(shown, left)]
     body = _BODY * ground.believe.smallest * float(np.mean([e.size for e in left] or [0]))

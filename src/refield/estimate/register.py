@@ -1,7 +1,8 @@
 """Registering an object's coloured surface to the new photos over all rotations: candidates for its pose change.
 
 Meant for objects with too little texture or too few pixels for matched features. A thousand starting rotations, all of
-SO(3) and more finely those about the support's normal, each improved by a few Gauss–Newton steps on blurred photos.
+SO(3) and more finely those about the support's normal, each improved by two Gauss–Newton steps on blurred photos, and
+the likelier ones by more.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class RegisterConfig:
     points: int = 350
     """of the cloud in the coarse search"""
     steps: int = 7
-    """Gauss–Newton steps in the coarse search"""
+    """Gauss–Newton steps in the coarse search, of starting poses that are likely after the first ones"""
     keep: int = 24
     """best poses that go on to the fine search"""
     coarse_blur: float = 0.09
