@@ -120,11 +120,9 @@ class Search:
     def _outlines(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object outlined by its motion; the rest may be a thing that left."""
         old, change = best.olds[k], best.moved.get(k)
-        other = (
-            None
-            if id(old) in self.anew or k not in {*best.moved, *best.removed}
-            else self._outlined(best, k, old, change)
-        )
+        if id(old) in self.anew or (change is None and k not in best.removed):
+            return
+        other = self._outlined(best, k, old, change)
         if other is None:
             return
         self.anew[id(other)] = other
@@ -189,9 +187,8 @@ class Search:
         came = [_box(self.ground.hull.lattice, part) for part in best.arrived]
         olds = {k: old for k, old in enumerate(best.olds) if k not in best.removed}
         some = {k: old for k, old in olds.items() if _beside(_box(old.lattice, old.voxels), came)}
-        return [(k, one) for k, old in some.items() for one in (old, old.instead) if one is not None] + self._whole(
-            some
-        )
+        asked = [(k, one) for k, old in some.items() for one in (old, old.instead) if one is not None]
+        return asked + self._whole(some)
 
     def _slides(self, best: Settled, k: int, one: Old) -> Iterator[Settled]:
         """With an object that slid."""
