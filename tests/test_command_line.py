@@ -21,6 +21,7 @@ from refield.commands.brief import options_of
 from refield.commands.clock import Clock
 from refield.commands.completion import script
 from refield.commands.options import Output, kind_of, names, parsed, shown
+from refield.field.fit import FitProgress
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import did_you_mean
 from refield.visits import make
@@ -193,6 +194,13 @@ def test_warnings_are_heard_where_it_is_quiet(capsys):
     clock.stage("look")
     clock.warn("mind the step")
     assert capsys.readouterr().err == "warning: mind the step\n"
+
+
+def test_a_fit_whose_time_was_over_early_says_so():
+    with Clock(quiet=True).training("fit") as line:
+        for step, left, cut in ((29, 0.0, 0.29), (29, 3.0, None), (80, 0.0, None), (100, 0.0, None)):
+            line(FitProgress(step, 100, 12.3, 1e3, 40.0, 55.0, left))
+            assert line.cut_short == cut
 
 
 def test_stages_tell_how_long_is_left(capsys):

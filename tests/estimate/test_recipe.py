@@ -126,6 +126,12 @@ def test_another_scene_is_refused(old, tmp_path):
         estimate(old, BoxWorld((wall,)), tmp_path)
 
 
+def test_a_field_that_does_not_show_its_own_photos_is_refused(old, tmp_path):
+    wall = BoxWorld((standing((0.95, 0.95, 0.5), 0, 0, 0, paint=-1),))
+    with pytest.raises(InputError, match="the field: it shows its own photos hardly better"):
+        estimate_change(old, wall, new_photos(BEFORE, tmp_path), EstimateConfig(survey=6))
+
+
 def test_an_object_that_an_earlier_visit_found_is_not_segmented_again(old, tmp_path):
     """§11.3.2: only its old pictures are looked at, and the shape is the one that was known."""
     true = turn(centre(CRATE), 50, (0.35, -0.15, 0))

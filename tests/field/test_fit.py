@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numba.core import event
 from PIL import Image
 
 from refield.field import kernels
 from refield.field.descent import MOST_SKIPPED, NonFiniteError
+from refield.field.encoding import Contraction
 from refield.field.fit import FitConfig, FitProgress, _Fit, fit_field
 from refield.field.memory import memory_of
 from refield.field.photos import HeldOut, Photos, Since
@@ -399,3 +402,19 @@ def test_pixels_on_a_device_are_the_banks(capture: Capture) -> None:
     assert len(device) == len(bank)
     torch.testing.assert_close(device.rays(chosen).directions, bank.rays(chosen).directions)
     assert torch.equal(device.colours(chosen), bank.colours(chosen))
+
+
+def test_what_compiles_before_the_first_step_takes_no_time_from_the_fit(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a new machine the first look at the photos compiles every kernel, which can take longer than a whole draft."""
+
+    def compiles(capture: Capture) -> Contraction:
+        with event.trigger_event("numba:compile"):
+            time.sleep(1.0)
+        return place_contraction(capture)
+
+    monkeypatch.setattr("refield.field.fit._core", compiles)
+    looks: list[FitProgress] = []
+    fit_field(capture, replace(TINY, steps=3, samples=512, max_seconds=1.0, look_around=True), looks.append)
+    assert looks[-1].step == 3

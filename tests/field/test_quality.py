@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numba
 import numpy as np
 import torch
+from numba.core import event
 
 from refield.field.compiling import compiling
 from refield.field.fit import FitConfig
@@ -75,3 +77,9 @@ def test_compiling_is_noticed() -> None:
     with compiling() as again:
         twice(np.float32(3))
     assert first.seconds > 0 and again.seconds == 0
+
+
+def test_compiling_within_what_is_timed_is_no_work() -> None:
+    with compiling() as whole, compiling() as part, event.trigger_event("numba:compile"):
+        time.sleep(0.2)
+    assert whole.seconds >= 0.2 and part.seconds >= 0.2 and whole.worked < 0.2

@@ -175,9 +175,13 @@ class TrainingLine:
         self._console, self._progress, self._task, self._name = console, progress, task, name
         self._shown = time.perf_counter()
         self.psnr = math.nan
+        self.cut_short: float | None = None
+        """part of its steps that a fit had done when its time was over, if that is less than half"""
 
     def __call__(self, look: Look) -> None:
-        self.psnr = look.psnr
+        self.psnr, done = look.psnr, look.step / look.steps
+        over = isinstance(look, FitProgress) and look.seconds_left <= 0
+        self.cut_short = done if over and done < 0.5 else None
         self._progress.update(self._task, completed=look.step / look.steps, facts=_facts(look))
         if self._progress.disable and time.perf_counter() - self._shown > _QUIET_SECONDS:
             self._shown = time.perf_counter()

@@ -150,6 +150,9 @@ def train(
                 raise
             fitted, found = error.field, capture
             clock.warn(f"{error}; the last good state is kept, look at it before you use it")
+        if line.cut_short is not None:
+            done = f"its time was over after {100 * line.cut_short:.0f} % of its steps"
+            clock.warn(f"the fit: {done}; refield train {task.work} --more goes on with it")
         clock.stage("keep the field")
         workspace.keep_field(fitted, line.psnr)
         workspace.keep_refined(capture, found)

@@ -41,6 +41,7 @@ from refield.scene.planes import Plane, rough_planes, rough_tops
 OnStage = Callable[[str], None]
 _MUCH_NEW = 0.02  # of a photo's pixels, from which on it is said that no old photo saw what they show
 _OTHER_LIGHT = 2.0  # times brighter or darker, from which on a photo's light is spoken of
+_KNOWS = 0.5  # of its own photos' variance; a field that shows less of it tells no change
 
 
 @dataclass(frozen=True)
@@ -117,8 +118,8 @@ def estimate_change(
             segmented again (§11.3.2).
 
     Raises:
-        InputError: there is no new photo; most of the pixels changed: the photos show another scene; or a model cannot
-            be opened.
+        InputError: there is no new photo; most of the pixels changed: the photos show another scene; the field does not
+            show its own photos; or a model cannot be opened.
     """
     check_capture(capture)
     check_field(field)
@@ -165,6 +166,7 @@ def _detected(
 ) -> _Scene:
     views = [_placed(field, f, config) for f in frames]
     survey = [look.view_of(field, f, config.max_pixels) for f in look.spread_out(capture.frames, config.survey)]
+    _check_knows(survey)
     errors = detect.errors(survey, Memory.of(field, capture.train), config.detect)
     changed = detect.changes(views, errors, config.detect)
     shares = [float(c.mask.mean()) for c in changed]
@@ -182,6 +184,14 @@ def _detected(
     planes = _planes(survey, changed)
     changed = light.set_light_aside(changed, planes, config.detect)
     return _Scene(capture, field, config, tuple(survey), errors, tuple(changed), photos, planes, models, ())
+
+
+def _check_knows(survey: Sequence[View]) -> None:
+    """Refuse a field whose fit ended before it showed its own photos."""
+    missed = [((v.photo - v.rgb) ** 2).mean() / max(v.photo.var(axis=(0, 1)).mean(), 1e-6) for v in survey]
+    if np.median(missed) > 1 - _KNOWS:
+        what = f"it shows its own photos hardly better than one colour would ({100 * (1 - np.median(missed)):.0f} %)"
+        raise InputError("the field", what, "go on with its fit: refield train WORK --more")
 
 
 def _as_the_paper_sees(

@@ -1,4 +1,4 @@
-"""How long kernels were compiled: once on a machine, and no part of what a fit may take."""
+"""How long a fit works: not while kernels are compiled, which happens once on a machine."""
 
 from __future__ import annotations
 
@@ -16,9 +16,14 @@ class Compiling(event.Listener):
     """Adds up the time in which something is compiled, one within the other counted once."""
 
     def __init__(self) -> None:
-        self._depth, self._since = 0, 0.0
+        self._depth, self._since, self._began = 0, 0.0, time.perf_counter()
         self.seconds = 0.0
         """so far"""
+
+    @property
+    def worked(self) -> float:
+        """Seconds since this listens, without those."""
+        return time.perf_counter() - self._began - self.seconds
 
     def on_start(self, event: Any) -> None:
         if self._depth == 0:

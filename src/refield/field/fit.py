@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Generic, Literal, TypeVar
@@ -173,29 +172,30 @@ def fit_capture(
     check_capture(capture)
     expect("the config of a fit", config, FitConfig, "a refield.field.fit.FitConfig")
     capture, since = as_read(capture, since, config.size)
-    began, photos = time.perf_counter(), Photos.of(capture, since, most_pixels(config))
-    core = _core(capture) if start is None and config.look_around else None
-    left_out: list[float] = []  # of each fit that was given up
-    for attempt in range(_TRIES):
-        # the last one is the best of those before, to its end
-        seed = config.seed + (attempt if attempt < _TRIES - 1 else left_out.index(max(left_out)))
-        torch.manual_seed(seed)
-        model = new_field(capture, config, seed, core) if start is None else opened(start)
-        try:
-            if config.device == "cuda":
-                found = _fit_on_gpu(model, capture, photos, config, on_progress, on_step)
-            else:
-                may_give_up = start is None and attempt < _TRIES - 1
-                run = _Fit(model, photos, config, on_progress, on_step, began=began, goes_on=goes_on)
-                run.run(may_give_up)
-                found = run.photos.told(capture, run.judge, model)
-            break
-        except _StuckError as error:
-            left_out.append(error.left_out)
-            continue
-        except NonFiniteError as error:
-            error.field = model.eval().requires_grad_(False)
-            raise
+    with compiling() as clock:
+        photos = Photos.of(capture, since, most_pixels(config))
+        core = _core(capture) if start is None and config.look_around else None
+        left_out: list[float] = []  # of each fit that was given up
+        for attempt in range(_TRIES):
+            # the last one is the best of those before, to its end
+            seed = config.seed + (attempt if attempt < _TRIES - 1 else left_out.index(max(left_out)))
+            torch.manual_seed(seed)
+            model = new_field(capture, config, seed, core) if start is None else opened(start)
+            try:
+                if config.device == "cuda":
+                    found = _fit_on_gpu(model, capture, photos, config, on_progress, on_step)
+                else:
+                    may_give_up = start is None and attempt < _TRIES - 1
+                    run = _Fit(model, photos, config, on_progress, on_step, clock, goes_on=goes_on)
+                    run.run(may_give_up)
+                    found = run.photos.told(capture, run.judge, model)
+                break
+            except _StuckError as error:
+                left_out.append(error.left_out)
+                continue
+            except NonFiniteError as error:
+                error.field = model.eval().requires_grad_(False)
+                raise
     return Fitted(model.eval().requires_grad_(False), at_full_size(found))
 
 
@@ -252,7 +252,7 @@ class _Fit:
         config: FitConfig,
         on_progress: ProgressCallback | None,
         on_step: StepCallback | None,
-        began: float | None = None,
+        clock: Compiling | None = None,
         goes_on: bool = False,
     ) -> None:
         self.goes_on = goes_on
@@ -269,8 +269,7 @@ class _Fit:
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
         self.samples_per_ray = config.samples / 512
-        self.began = time.perf_counter() if began is None else began
-        self.compiling = Compiling()
+        self.clock = clock or Compiling()
         self.loss = math.nan
         self.first: tuple[float, float] | None = None  # at the first step that `_stuck` asks
         self.rays_done, self.steps_done = 0, 0
@@ -281,8 +280,7 @@ class _Fit:
         """Raises _StuckError early on if the fit leads nowhere and ``may_give_up``."""
         self.model.train()
         try:
-            with compiling() as self.compiling:
-                self._steps(may_give_up)
+            self._steps(may_give_up)
         except NonFiniteError:
             self._settle()
             raise
@@ -312,7 +310,7 @@ class _Fit:
                     break
 
     def _progress(self, step: int) -> float:
-        return progress_of(self.config, step, self.began + self.compiling.seconds)
+        return progress_of(self.config, step, self.clock.worked)
 
     def _stuck(self) -> bool:
         """Whether, by the second step, the photos that teach have been learnt by heart; known only if some are left
@@ -371,9 +369,9 @@ class _Fit:
         psnr = self.judge.psnr(self.model, self.photos.exposing)
         self.model.train()
         if self.on_progress:
-            seconds = time.perf_counter() - self.began
-            counted = seconds - self.compiling.seconds
-            left = seconds_left(self.config, step, counted)
+            worked = self.clock.worked
+            left = seconds_left(self.config, step, worked)
+            seconds = worked + self.clock.seconds
             self.on_progress(
                 FitProgress(
                     step,
@@ -388,13 +386,13 @@ class _Fit:
         return psnr
 
 
-def progress_of(config: FitConfig, step: int, began: float) -> float:
-    """How far a fit is, 1 at its end: by its steps or by its seconds since ``began``, whichever is further on.
+def progress_of(config: FitConfig, step: int, seconds: float) -> float:
+    """How far a fit is, 1 at its end: by its steps or by the seconds that it works, whichever is further on.
 
     The first seconds do not count, so that a fit which ends long before its time is the same on any machine: the first
     steps take the longest.
     """
-    part = (time.perf_counter() - began) / config.max_seconds if config.max_seconds else 0.0
+    part = seconds / config.max_seconds if config.max_seconds else 0.0
     return max(step / config.steps, (part - _FIRST) / (1 - _FIRST))
 
 

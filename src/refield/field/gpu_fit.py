@@ -124,7 +124,7 @@ class _GpuFit:
         looks: list[float] = []
         due = self.config.check_every
         graph, step = self._captured(0)
-        while progress_of(self.config, step, self.began) < 1:
+        while progress_of(self.config, step, time.perf_counter() - self.began) < 1:
             stage = self.photos.stage(graph.progress)
             step = self._round(graph, step)
             self.step, samples = step, int(graph.samples)
@@ -173,7 +173,7 @@ class _GpuFit:
 
     def _expose(self, step: int) -> float:
         """How far the fit is; and find out, when that is due, whether photos are exposed alike."""
-        progress = progress_of(self.config, step, self.began)
+        progress = progress_of(self.config, step, time.perf_counter() - self.began)
         if self.photos.may_expose(max(step / self.config.steps, progress / 2)):
             self.photos.exposing = self.judge.tells_exposures(self.model)
             self.model.train()
@@ -182,14 +182,14 @@ class _GpuFit:
     def _learn(self, graph: GraphedStep, step: int) -> None:
         """What a replay found goes to the photos; outside of the graph, since it solves equations."""
         assert graph.asked is not None and graph.found is not None
-        progress = progress_of(self.config, step, self.began)
+        progress = progress_of(self.config, step, time.perf_counter() - self.began)
         self.photos.learn(graph.asked, graph.found, progress, rate_factor(progress))
 
     def _set_rate(self, step: int) -> None:
         self.descent.rate.fill_(self._rate(step))
 
     def _rate(self, step: int) -> float:
-        return self.config.rate * rate_factor(progress_of(self.config, step, self.began))
+        return self.config.rate * rate_factor(progress_of(self.config, step, time.perf_counter() - self.began))
 
     def _resized(self, samples: int) -> bool:
         """Choose the rays of a step and the lattice anew, after a step with so many samples; whether either changed."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from refield.field import kernels
+from refield.field.compiling import Compiling, compiling
 from refield.field.descent import NonFiniteError, TableAdam
 from refield.field.kernels.reference import Aim, Batch, Fixed, Unwanted
 from refield.field.radiance import HashField
@@ -114,11 +114,14 @@ class HelperTraining:
 
         The state that showed the held-out pixels best is kept: few photos are soon learnt by heart.
         """
+        with compiling() as clock:
+            return self._run(on_progress, clock)
+
+    def _run(self, on_progress: Callable[[UpdateProgress], None] | None, clock: Compiling) -> list[float]:
         looks: list[float] = []
-        began, c = time.perf_counter(), self.config
-        best: dict[str, Tensor] = {}
+        best, c = dict[str, Tensor](), self.config
         for step in range(c.steps):
-            progress = max(step / c.steps, (time.perf_counter() - began) / c.max_seconds)
+            progress = max(step / c.steps, clock.worked / c.max_seconds)
             if progress >= 1:
                 self.why_stopped = "out of time"
                 break
@@ -136,7 +139,7 @@ class HelperTraining:
                 if looks[-1] == max(looks):
                     best = {k: v.detach().clone() for k, v in self.helper.state_dict().items()}
                 if on_progress:
-                    on_progress(UpdateProgress(step + 1, c.steps, looks[-1], time.perf_counter() - began))
+                    on_progress(UpdateProgress(step + 1, c.steps, looks[-1], clock.worked))
                 if at_plateau(looks, c):
                     self.why_stopped = "held-out pixels stopped gaining"
                     break
