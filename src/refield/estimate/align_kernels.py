@@ -3,6 +3,10 @@
 Letters: V views, N points, K poses. A pose is R (3, 3) and c (3,): a point p of the old object is now at
 ``R (p - p0) + c``, p0 the old centre. A view's lens is 26 numbers: cam_from_world R (9) and t (3), fx fy cx cy,
 k1 k2 p1 p2 k3, height, width, and its centre in the world (see `lens_of`).
+
+What the views show of the points at a pose is looked up once (`_look`) and kept in rows, one for each view that sees a
+point: ``seen`` (M, 4 + C) holds the cosine, the point in camera axes (3) and the view's first C channels, ``of`` (M, 2)
+which point and view it is, ``row_of`` (N, V) which row, or -1; ``placed`` (N, 9) the points as `_place` puts them.
 """
 
 from __future__ import annotations
@@ -39,15 +43,14 @@ def _project(lens: _F64, x: float, y: float, z: float, out: _F64) -> bool:
 
 
 @njit(cache=True, fastmath=True)
-def _sample(image: _F32, u: float, v: float, out: _F64) -> None:
-    """Bilinear values of all channels at pixel position (u, v), centres at +0.5."""
+def _sample(image: _F32, u: float, v: float, row: _F64) -> None:
+    """Bilinear values at pixel position (u, v), centres at +0.5, of as many channels as a row of ``seen`` has."""
     x, y = u - 0.5, v - 0.5
     i, j = int(y), int(x)
     fy, fx = y - i, x - j
-    for c in range(image.shape[2]):
-        top = image[i, j, c] * (1 - fx) + image[i, j + 1, c] * fx
-        bottom = image[i + 1, j, c] * (1 - fx) + image[i + 1, j + 1, c] * fx
-        out[c] = top * (1 - fy) + bottom * fy
+    a, b, c, d = (1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx
+    for k in range(row.shape[0] - 4):
+        row[4 + k] = a * image[i, j, k] + b * image[i, j + 1, k] + c * image[i + 1, j, k] + d * image[i + 1, j + 1, k]
 
 
 @njit(cache=True, fastmath=True)
@@ -97,25 +100,49 @@ def _seen(lens: _F64, depth: _F32, p: _F64, radius: float, at: _F64) -> float:
 
 
 @njit(cache=True, fastmath=True)
-def _gains(
-    points: _F64, sides: _I64, colours: _F32, lenses: _F64, images: _F32, depths: _F32, r: _F64, c: _F64, radius: float
-) -> _F64:
+def _look(
+    points: _F64,
+    lenses: _F64,
+    images: _F32,
+    depths: _F32,
+    r: _F64,
+    c: _F64,
+    radius: float,
+    placed: _F64,
+    of: _I64,
+    row_of: _I64,
+    seen: _F64,
+) -> int:
+    """Fill ``placed``, ``of``, ``row_of`` and ``seen`` for a pose; how many rows it is."""
+    rows, at = 0, np.zeros(6)
+    for n in range(points.shape[0]):
+        p = placed[n]
+        _place(points, n, r, c, p)
+        for v in range(lenses.shape[0]):
+            row_of[n, v] = -1
+            cosine = _seen(lenses[v], depths[v], p, radius, at)
+            if cosine == 0.0:
+                continue
+            row = seen[rows]
+            row[0], row[1], row[2], row[3] = cosine, at[2], at[3], at[4]
+            _sample(images[v], at[0], at[1], row)
+            of[rows, 0], of[rows, 1], row_of[n, v] = n, v, rows
+            rows += 1
+    return rows
+
+
+@njit(cache=True, fastmath=True)
+def _gains(rows: int, of: _I64, seen: _F64, sides: _I64, colours: _F32) -> _F64:
     """How much brighter each side of the object is where it is now: grey factors, held near 1 where little is seen."""
     count = 0
     for n in range(sides.shape[0]):
         count = max(count, sides[n] + 1)
     num, den = np.zeros(count), np.zeros(count)
-    p, at, px = np.zeros(9), np.zeros(6), np.zeros(9)
-    for n in range(points.shape[0]):
-        _place(points, n, r, c, p)
-        for v in range(lenses.shape[0]):
-            cosine = _seen(lenses[v], depths[v], p, radius, at)
-            if cosine == 0.0:
-                continue
-            _sample(images[v], at[0], at[1], px)
-            for k in range(3):
-                num[sides[n]] += cosine * px[k] * colours[n, k]
-                den[sides[n]] += cosine * colours[n, k] ** 2
+    for m in range(rows):
+        n, cosine = of[m, 0], seen[m, 0]
+        for k in range(3):
+            num[sides[n]] += cosine * seen[m, 4 + k] * colours[n, k]
+            den[sides[n]] += cosine * colours[n, k] ** 2
     out = np.ones(count)
     hold = 0.1 * den.sum() / count + 1e-9
     for b in range(count):
@@ -135,40 +162,47 @@ def _step(
     c: _F64,
     scale: float,
     radius: float,
+    placed: _F64,
+    of: _I64,
+    row_of: _I64,
+    seen: _F64,
 ) -> bool:
     """One damped Gauss–Newton step on the photos' colours at the points; changes r and c in place."""
-    gains = _gains(points, sides, colours, lenses, images, depths, r, c, radius)
+    rows = _look(points, lenses, images, depths, r, c, radius, placed, of, row_of, seen)
+    gains = _gains(rows, of, seen, sides, colours)
     h, g = np.zeros((6, 6)), np.zeros(6)
-    p, at, px, row, e = np.zeros(9), np.zeros(6), np.zeros(9), np.zeros(6), np.zeros(3)
-    for n in range(points.shape[0]):
-        _place(points, n, r, c, p)
-        for v in range(lenses.shape[0]):
-            lens = lenses[v]
-            cosine = _seen(lens, depths[v], p, radius, at)
-            if cosine == 0.0:
-                continue
-            _sample(images[v], at[0], at[1], px)
-            size = 0.0
-            for k in range(3):
-                e[k] = px[k] - gains[sides[n]] * colours[n, k]
-                size += e[k] * e[k]
-            weight = cosine / (1 + size / scale**2) ** 2
-            zi = 1 / at[4]
-            # d(u, v)/d(point in camera axes), the lens' distortion left out of the derivative
-            ux, uz = lens[12] * zi, -lens[12] * at[2] * zi * zi
-            wy, wz = lens[13] * zi, -lens[13] * at[3] * zi * zi
-            for k in range(3):
-                gu, gv = px[3 + 2 * k], px[4 + 2 * k]
-                a, b, d = gu * ux, gv * wy, gu * uz + gv * wz
-                jx = a * lens[0] + b * lens[3] + d * lens[6]
-                jy = a * lens[1] + b * lens[4] + d * lens[7]
-                jz = a * lens[2] + b * lens[5] + d * lens[8]
-                row[0], row[1], row[2] = jx * radius, jy * radius, jz * radius
-                row[3], row[4], row[5] = p[4] * jz - p[5] * jy, p[5] * jx - p[3] * jz, p[3] * jy - p[4] * jx
-                for i in range(6):
-                    g[i] += weight * row[i] * e[k]
-                    for j in range(i + 1):
-                        h[i, j] += weight * row[i] * row[j]
+    ju, jv, e = np.zeros(6), np.zeros(6), np.zeros(3)
+    for m in range(rows):
+        n, lens, at, p = of[m, 0], lenses[of[m, 1]], seen[m], placed[of[m, 0]]
+        size = 0.0
+        for k in range(3):
+            e[k] = at[4 + k] - gains[sides[n]] * colours[n, k]
+            size += e[k] * e[k]
+        weight = at[0] / (1 + size / scale**2) ** 2
+        zi = 1 / at[3]
+        # d(u, v)/d(point in camera axes), the lens' distortion left out of the derivative
+        ux, uz = lens[12] * zi, -lens[12] * at[1] * zi * zi
+        wy, wz = lens[13] * zi, -lens[13] * at[2] * zi * zi
+        suu = svv = suv = su = sv = 0.0  # sums over the channels
+        for k in range(3):
+            gu, gv = at[7 + 2 * k], at[8 + 2 * k]
+            suu += gu * gu
+            suv += gu * gv
+            svv += gv * gv
+            su += gu * e[k]
+            sv += gv * e[k]
+        for i in range(3):
+            ju[i] = (ux * lens[i] + uz * lens[6 + i]) * radius
+            jv[i] = (wy * lens[3 + i] + wz * lens[6 + i]) * radius
+        for j in (ju, jv):
+            j[3] = (p[4] * j[2] - p[5] * j[1]) / radius
+            j[4] = (p[5] * j[0] - p[3] * j[2]) / radius
+            j[5] = (p[3] * j[1] - p[4] * j[0]) / radius
+        for i in range(6):
+            g[i] += weight * (ju[i] * su + jv[i] * sv)
+            a, b = weight * (suu * ju[i] + suv * jv[i]), weight * (suv * ju[i] + svv * jv[i])
+            for j in range(i + 1):
+                h[i, j] += a * ju[j] + b * jv[j]
     return _solved(h, g, r, c, radius)
 
 
@@ -228,21 +262,26 @@ def _score(
     cap: float,
     radius: float,
     block: int,
+    placed: _F64,
+    of: _I64,
+    row_of: _I64,
+    seen: _F64,
 ) -> float:
     """Mean capped colour error of the points that face the views plus the part of the target that stays uncovered.
 
     A point that something hides, or that lies beyond the photo, speaks neither for the pose nor against it: it counts
     half. Else a pose of which next to nothing can be seen would be as good as any.
     """
-    gains = _gains(points, sides, colours, lenses, images, depths, r, c, radius)
+    rows = _look(points, lenses, images, depths, r, c, radius, placed, of, row_of, seen)
+    gains = _gains(rows, of, seen, sides, colours)
     error, total, uncovered, wanted = 0.0, 0.0, 0.0, 0.0
-    p, at, px = np.zeros(9), np.zeros(6), np.zeros(9)
+    at = np.zeros(6)
     for v in range(lenses.shape[0]):
         lens = lenses[v]
         covered = np.zeros((int(lens[21]) // block + 1, int(lens[22]) // block + 1), np.uint8)
         for n in range(points.shape[0]):
-            _place(points, n, r, c, p)
-            cosine, distance = _facing(lens, p)
+            p, m = placed[n], row_of[n, v]
+            cosine, _ = _facing(lens, p)
             if cosine < 0.1:
                 continue
             shown = _project(lens, p[0], p[1], p[2], at)
@@ -252,16 +291,15 @@ def _score(
             if cosine < 0.2:
                 continue
             total += cosine
-            if not shown or distance > depths[v, i, j] + 0.3 * radius:
+            if m < 0:
                 error += 0.5 * cosine
                 continue
             if targets[v, i, j] < 0:  # certainly unchanged: nothing can be in front here
                 error += cosine
                 continue
-            _sample(images[v], at[0], at[1], px)
             e, gain = 0.0, gains[sides[n]]
             for k in range(3):
-                e += (px[k] - gain * colours[n, k]) ** 2
+                e += (seen[m, 4 + k] - gain * colours[n, k]) ** 2
             # a side may be lit differently, but the less the better
             error += cosine * min(1.0, e / cap**2 + 0.25 * math.log(gain) ** 2)
         for i in range(int(lens[21])):
@@ -298,11 +336,16 @@ def register_all(
     points (N, 6): position and normal; sides (N,) the side of the object each is on; colours (N, 3); images
     (V, H, W, 9): colour and its derivatives; depths, targets (V, H, W).
     """
-    out = np.zeros(rotations.shape[0])
+    out, n, v = np.zeros(rotations.shape[0]), points.shape[0], lenses.shape[0]
     for k in prange(rotations.shape[0]):
         r, c = rotations[k], centres[k]
+        placed, of, row_of = np.empty((n, 9)), np.empty((n * v, 2), np.int64), np.empty((n, v), np.int64)
+        seen = np.empty((n * v, 13))
         for _ in range(steps):
-            if not _step(points, sides, colours, lenses, images, depths, r, c, scale, radius):
+            if not _step(points, sides, colours, lenses, images, depths, r, c, scale, radius, placed, of, row_of, seen):
                 break
-        out[k] = _score(points, sides, colours, lenses, images, depths, targets, r, c, cap, radius, block)
+        out[k] = _score(
+            points, sides, colours, lenses, images, depths, targets, r, c, cap, radius, block, placed, of, row_of,
+            seen[:, :7],
+        )  # fmt: skip
     return out

@@ -6,7 +6,7 @@ Begun with the objects placed one by one, then changed by one exchange at a time
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count
@@ -32,6 +32,8 @@ from refield.estimate.past import Past, changed_share
 from refield.estimate.pose_change import FINER, PoseChange, refine
 from refield.scene.pose import transform
 from refield.vision import pixels
+
+_Tries = Callable[[Settled], Iterator[Settled]]
 
 
 @dataclass(frozen=True)
@@ -60,20 +62,29 @@ class Search:
         """
         best, least = judged(self.ground, self._placed(olds, begun or Settled()))
         again = True
+        tried: set[tuple[int, ...]] = set()  # beside this best one
         while again:
             again = False
-            for tries in (
-                *(partial(self._elsewhere, k=k) for k in list(self.fits)),
-                *(partial(self._stayed, k=k) for k in (*best.moved, *best.removed)),
-                *(partial(self._outlines, k=k) for k in (*best.moved, *best.removed)),
-                *(partial(self._slides, k=k, one=one) for k, one in self._asked(best)),
-            ):
+            for this, tries in self._exchanges(best):
+                if this in tried:
+                    continue
+                tried.add(this)
                 others = [judged(self.ground, other) for other in tries(best)]
                 other, left = min(others, key=lambda o: o[1], default=(best, least))
                 if left < least - 1:  # pixel
-                    again, best, least = True, other, left
+                    again, best, least, tried = True, other, left, set()
         still = self.ground.believe.still
         return replace(best, moved={k: c for k, c in best.moved.items() if _noticeable(best.olds[k], c, still)})
+
+    def _exchanges(self, best: Settled) -> list[tuple[tuple[int, ...], _Tries]]:
+        """What is tried beside a hypothesis, each with what tells it from the others."""
+        changed = (*best.moved, *best.removed)
+        return [
+            *(((0, k), partial(self._elsewhere, k=k)) for k in self.fits),
+            *(((1, k), partial(self._stayed, k=k)) for k in changed),
+            *(((2, k), partial(self._outlines, k=k)) for k in changed),
+            *(((3, k, id(one)), partial(self._slides, k=k, one=one)) for k, one in self._asked(best)),
+        ]
 
     def _placed(self, olds: Sequence[Old], begun: Settled) -> Settled:
         """The hypothesis that more objects are where each is found by itself, one after the other."""
