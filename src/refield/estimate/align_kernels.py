@@ -194,10 +194,10 @@ def _step(
         for i in range(3):
             ju[i] = (ux * lens[i] + uz * lens[6 + i]) * radius
             jv[i] = (wy * lens[3 + i] + wz * lens[6 + i]) * radius
-        for j in (ju, jv):
-            j[3] = (p[4] * j[2] - p[5] * j[1]) / radius
-            j[4] = (p[5] * j[0] - p[3] * j[2]) / radius
-            j[5] = (p[3] * j[1] - p[4] * j[0]) / radius
+        for slope in (ju, jv):
+            slope[3] = (p[4] * slope[2] - p[5] * slope[1]) / radius
+            slope[4] = (p[5] * slope[0] - p[3] * slope[2]) / radius
+            slope[5] = (p[3] * slope[1] - p[4] * slope[0]) / radius
         for i in range(6):
             g[i] += weight * (ju[i] * su + jv[i] * sv)
             a, b = weight * (suu * ju[i] + suv * jv[i]), weight * (suv * ju[i] + svv * jv[i])

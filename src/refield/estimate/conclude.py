@@ -13,6 +13,7 @@ from torch import Tensor
 
 from refield.estimate import past, segment
 from refield.estimate.arrive import fresh, shadow_of
+from refield.estimate.confidence import confidence
 from refield.estimate.detect import Changed, Errors, Mask
 from refield.estimate.hull import Hull
 from refield.estimate.lattice import Lattice, Voxels
@@ -51,17 +52,17 @@ class Told:
 def concluded(scene: Told, settled: Settled) -> SceneChange:
     """The estimate's answer: what is believed, why, and what is not understood."""
     olds, frames, lattice = settled.olds, scene.frames, scene.carved.lattice
-    changes = [_moved(frames, olds[k], change) for k, change in settled.moved.items()]
+    changes = [_moved(frames, olds[k], change, settled.led[k]) for k, change in settled.moved.items()]
     for k, share in settled.removed.items():
         note = f"{100 * share:.0f} % of its pixels show what is behind it"
-        masks = _masks_of(frames, olds[k])
-        changes.append(ObjectChange("removed", olds[k].shape, masks=masks, confidence=share, note=note))
-    for part in settled.arrived:
+        note += "; or it moved, and shows a side that no old photo saw" if settled.arrived else ""
+        masks, sure = _masks_of(frames, olds[k]), confidence("removed", settled.led[k], bool(settled.arrived))
+        changes.append(ObjectChange("removed", olds[k].shape, masks=masks, confidence=sure, note=note))
+    for part, lead in zip(settled.arrived, settled.came):
         grid, share = _newcomer(lattice, part), fresh(settled.views, lattice, part)
         note = f"it hides what was there in {100 * share:.0f} % of its pixels, and nothing that left looks like it"
-        changes.append(
-            ObjectChange("added", grid, masks_in=segment.masks_in(frames, grid), confidence=share, note=note)
-        )
+        masks, sure = segment.masks_in(frames, grid), confidence("added", lead, bool(settled.removed))
+        changes.append(ObjectChange("added", grid, masks_in=masks, confidence=sure, note=note))
     left = _unexplained(scene, settled)
     reasons = [f"1 {c.kind}{_by(c)}: {c.note}" for c in changes]
     reasons += [_said_of(scene, left)] if left else []
@@ -84,7 +85,7 @@ def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...], err
     return SceneChange((), photos, why, unexplained=tuple(full_size(c.mask, c.view.frame) for c in changed))
 
 
-def _moved(frames: Sequence[Frame], old: Old, change: PoseChange) -> ObjectChange:
+def _moved(frames: Sequence[Frame], old: Old, change: PoseChange, lead: float) -> ObjectChange:
     centre = transform(change.new_from_old, torch.from_numpy(old.centre).double())
     about = adjoint(rigid(torch.eye(3, dtype=torch.float64), centre))
     moved = ObjectChange(
@@ -93,7 +94,7 @@ def _moved(frames: Sequence[Frame], old: Old, change: PoseChange) -> ObjectChang
         change.new_from_old,
         _masks_of(frames, old),
         segment.masks_in(frames, old.shape.moved(change.new_from_old)),
-        confidence=change.explained,
+        confidence=confidence("moved", lead, False),
         covariance=about @ change.covariance @ about.T,
     )
     return replace(moved, note=_why_moved(change))

@@ -20,7 +20,7 @@ from refield.estimate.ground import Ground
 from refield.estimate.lattice import Voxels
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
-from refield.estimate.past import Past
+from refield.estimate.past import Past, silhouette
 from refield.estimate.pose_change import SIDE, PoseChange
 from refield.scene.pose import invert, transform
 
@@ -45,6 +45,11 @@ class Settled:
     """the old objects, those that were found again without what cannot be theirs"""
     touched: tuple[int, ...] = ()
     """indices of those that may have moved or left"""
+    came: tuple[float, ...] = ()
+    """of what arrived: pixels that are explained by it, as a part of those that show it"""
+    led: dict[int, float] = field(default_factory=dict)
+    """by index of the old object: pixels that the best other answer for it does not explain and this one does, as a
+    part of those that show it or show where it was"""
 
 
 def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
@@ -55,15 +60,18 @@ def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     """
     found = [_left(ground, settled, p) for p in settled.views]
     left, tells = [e for e, _ in found], [t for _, t in found]
-    arrived = []
+    arrived, came = [], []
     for part in settled.arrived:
         shown = [shadow_of(p.view, ground.hull.lattice, part, p.depth) for p in settled.views]
-        if sum(float((e[here & t] - _CAME).sum()) for here, t, e in zip(shown, tells, left)) > 0:
+        gain = sum(float((e[here & t] - _CAME).sum()) for here, t, e in zip(shown, tells, left))
+        if gain > 0:
             arrived.append(part)
+            came.append(gain / sum(int(here.sum()) for here in shown))
             left = [np.where(here, _CAME, e) for here, e in zip(shown, left)]
     body = _BODY * ground.believe.smallest * float(np.mean([e.size for e in left] or [0]))
     bodies = 2 * len(settled.moved) + len(settled.removed)
-    return replace(settled, arrived=tuple(arrived)), bodies * body + sum(float(e.sum()) for e in left)
+    told = replace(settled, arrived=tuple(arrived), came=tuple(came))
+    return told, bodies * body + sum(float(e.sum()) for e in left)
 
 
 def _left(ground: Ground, settled: Settled, p: Past) -> tuple[Array, NDArray[np.bool_]]:
@@ -101,3 +109,12 @@ def _before(
     away = float(np.linalg.norm(transform(pose, torch.from_numpy(old.centre).double()).numpy() - view.centre))
     made = relit(known, SIDE * old.radius / (away * view.pixel_angle))
     return made, np.where(shown, at[..., 0], depth), shown, shown & (sides < 0)
+
+
+def pixels_of(ground: Ground, settled: Settled, k: int) -> int:
+    """How many pixels of the new photos show an object, or show where it was."""
+    old, change = settled.olds[k], settled.moved.get(k)
+    count = sum(int(silhouette(p.view, old).sum()) for p in settled.views)
+    if change is not None:
+        count += sum(int(_before(ground, old, change, p, p.rgb, p.beyond)[2].sum()) for p in settled.views)
+    return count

@@ -5,6 +5,7 @@ Begun with the objects placed one by one, then changed by one exchange at a time
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,7 +25,7 @@ from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
 from refield.estimate.lattice import Lattice, Voxels
 from refield.estimate.layers import Sight
-from refield.estimate.likelihood import Settled, judged
+from refield.estimate.likelihood import Settled, judged, pixels_of
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import standing
@@ -34,6 +35,9 @@ from refield.scene.pose import transform
 from refield.vision import pixels
 
 _Tries = Callable[[Settled], Iterator[Settled]]
+_Which = tuple[str, int, int]
+_OTHERS = ("elsewhere", "stayed")
+"""what says of an object something else, not the same more exactly"""
 
 
 @dataclass(frozen=True)
@@ -62,28 +66,36 @@ class Search:
         """
         best, least = judged(self.ground, self._placed(olds, begun or Settled()))
         again = True
-        tried: set[tuple[int, ...]] = set()  # beside this best one
+        tried: dict[_Which, float] = {}  # beside this best one
         while again:
             again = False
             for this, tries in self._exchanges(best):
                 if this in tried:
                     continue
-                tried.add(this)
                 others = [judged(self.ground, other) for other in tries(best)]
-                other, left = min(others, key=lambda o: o[1], default=(best, least))
-                if left < least - 1:  # pixel
-                    again, best, least, tried = True, other, left, set()
+                other, tried[this] = min(others, key=lambda o: o[1], default=(best, math.inf))
+                if tried[this] < least - 1:  # pixel
+                    again, best, least, tried = True, other, tried[this], {}
         still = self.ground.believe.still
-        return replace(best, moved={k: c for k, c in best.moved.items() if _noticeable(best.olds[k], c, still)})
+        moved = {k: c for k, c in best.moved.items() if _noticeable(best.olds[k], c, still)}
+        return self._led(replace(best, moved=moved), least, tried)
 
-    def _exchanges(self, best: Settled) -> list[tuple[tuple[int, ...], _Tries]]:
+    def _led(self, best: Settled, least: float, tried: dict[_Which, float]) -> Settled:
+        """The best hypothesis with how far it leads the other answers for each object that it tells of."""
+        led = {}
+        for k in (*best.moved, *best.removed):
+            other = min((left for (kind, j, *_), left in tried.items() if j == k and kind in _OTHERS), default=math.inf)
+            led[k] = (other - least) / max(pixels_of(self.ground, best, k), 1)
+        return replace(best, led=led)
+
+    def _exchanges(self, best: Settled) -> list[tuple[_Which, _Tries]]:
         """What is tried beside a hypothesis, each with what tells it from the others."""
         changed = (*best.moved, *best.removed)
         return [
-            *(((0, k), partial(self._elsewhere, k=k)) for k in self.fits),
-            *(((1, k), partial(self._stayed, k=k)) for k in changed),
-            *(((2, k), partial(self._outlines, k=k)) for k in changed),
-            *(((3, k, id(one)), partial(self._slides, k=k, one=one)) for k, one in self._asked(best)),
+            *((("elsewhere", k, 0), partial(self._elsewhere, k=k)) for k in self.fits),
+            *((("stayed", k, 0), partial(self._stayed, k=k)) for k in changed),
+            *((("outlined", k, 0), partial(self._outlines, k=k)) for k in changed),
+            *((("slid", k, id(one)), partial(self._slides, k=k, one=one)) for k, one in self._asked(best)),
         ]
 
     def _placed(self, olds: Sequence[Old], begun: Settled) -> Settled:

@@ -1,0 +1,30 @@
+"""How likely what is told is true: by how much the best other answer explains less, as a part of the pixels concerned.
+
+One curve for each kind, drawn through how often objects of random worlds were told right (docs/results.md, "How sure it
+is"): the part of what is left unexplained ranks them, the part of an object's pixels that look right does not.
+"""
+
+from __future__ import annotations
+
+import math
+
+from refield.scene.change import Kind
+
+_MOST = 0.93
+"""of objects that lead the others clearly; some of them are wrong all the same, since no right answer was tried"""
+_EVEN: dict[Kind, tuple[float, float]] = {"moved": (0.13, 0.05), "removed": (0.5, 0.06), "added": (0.1, 0.05)}
+"""the lead with which as many are right as wrong, and how much more makes it e times as many"""
+_ONE_OF_TWO = 0.2
+"""of what left where something arrived, and of what arrived where something left: most are one thing that moved"""
+
+
+def confidence(kind: Kind, lead: float, opposite: bool) -> float:
+    """How likely an object's kind, and its place within 2 % of the distance to the cameras, is right, 0 to 1.
+
+    Args:
+        lead: pixels that the best other answer does not explain and this one does, as a part of those concerned.
+        opposite: whether something arrived, for what left; whether something left, for what arrived.
+    """
+    even, scale = _EVEN[kind]
+    likely = _MOST / (1 + math.exp(-min(max((lead - even) / scale, -50.0), 50.0)))
+    return likely * (_ONE_OF_TWO if opposite else 1.0)
