@@ -58,6 +58,7 @@ def test_a_moved_box_is_found_with_its_pose_shape_and_masks(old, tmp_path):
     assert len(moved.masks) == len(moved.masks_in) == len(old.train)
     assert all(m.shape == (80, 80) and m.dtype == torch.bool for m in moved.masks)
     assert len(change.masks_in) == 4 and change.frames[0].name == "000.png"
+    assert moved.confidence > 0.9
 
 
 def test_the_papers_masks_can_take_the_place_of_ours(old, tmp_path):
@@ -109,6 +110,14 @@ def test_an_added_box_is_found(old, tmp_path):
     (new,) = estimate(old, BoxWorld((CRATE, DRUM, guest)), tmp_path).objects
     assert new.kind == "added" and new.masks == ()
     assert overlap(new.grid, guest)[1] > 0.4
+
+
+def test_what_left_where_another_came_is_told_with_doubt(old, tmp_path):
+    guest = standing((0.16, 0.16, 0.16), 0.1, -0.55, 35, paint=9)
+    change = estimate(old, BoxWorld((DRUM, guest)), tmp_path)
+    assert sorted(o.kind for o in change.objects) == ["added", "removed"]
+    assert all(o.confidence < 0.5 for o in change.objects)
+    assert "or it moved, and shows a side that no old photo saw" in change.why
 
 
 def test_nothing_changed_is_an_answer(old, tmp_path):

@@ -1,5 +1,6 @@
 """What became of everything that changed, by which hypothesis explains the photos best."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 
 from refield.estimate import recipe, settle
 from refield.estimate.lattice import grown
-from refield.estimate.likelihood import Settled, judged
+from refield.estimate.likelihood import Settled, judged, pixels_of
 from refield.scene.pose import angle_between, transform
 from tests.estimate.boxes import BoxWorld, capture_of, new_photos, standing, turn
 
@@ -66,6 +67,17 @@ def test_the_truth_leaves_less_unexplained_than_any_other_hypothesis(capture, tm
     for other in (put(turned), put(turn(CENTRE, 0, (0.05, 0, 0)) @ AWAY), came(), gone, nothing):
         assert left_by(other) > least + 0.05 * pixels
     assert left_by(came()) < left_by(gone) < left_by(nothing)
+    # what it leads by is told of it: the best other answer is close to that it left and another came
+    led = found.led[k] * pixels_of(ground, found, k)
+    assert 0.5 * led < left_by(came()) - least < 1.5 * led
+
+
+def test_the_lead_of_an_object_that_no_other_answer_was_tried_for_is_endless(capture, tmp_path, monkeypatch):
+    _, (ground, olds, changed, found) = settled(capture, tmp_path, monkeypatch)
+    search = settle.Search(ground, changed)
+    (k,) = found.moved
+    monkeypatch.setattr(settle.Search, "_exchanges", lambda self, best: [])
+    assert search.settle(olds).led == {k: math.inf} and 0.13 < found.led[k] < math.inf
 
 
 def test_a_newcomer_that_explains_nothing_is_taken_back(capture, tmp_path, monkeypatch):
