@@ -6,7 +6,7 @@ is"): the part of what is left unexplained ranks them, the part of an object's p
 
 from __future__ import annotations
 
-import math
+from scipy.special import expit
 
 from refield.scene.change import Kind
 
@@ -26,5 +26,4 @@ def confidence(kind: Kind, lead: float, opposite: bool) -> float:
         opposite: whether something arrived, for what left; whether something left, for what arrived.
     """
     even, scale = _EVEN[kind]
-    likely = _MOST / (1 + math.exp(-min(max((lead - even) / scale, -50.0), 50.0)))
-    return likely * (_ONE_OF_TWO if opposite else 1.0)
+    return _MOST * float(expit((lead - even) / scale)) * (_ONE_OF_TWO if opposite else 1.0)

@@ -7,7 +7,7 @@ that the layer slides over the image: a hash grid's own gradients oscillate, tho
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +19,6 @@ from torch import Tensor
 from refield.estimate.alone import object_alone, sampler_around
 from refield.estimate.detail import Detail
 from refield.estimate.explain import Compared
-from refield.estimate.kept import Kept
 from refield.estimate.look import Hidden, Seen, pixel_slopes, see
 from refield.estimate.objects import Old, box_in, patch_rays
 from refield.estimate.past import Past
@@ -31,7 +30,6 @@ from refield.scene.images import scaled_image
 from refield.scene.pose import exp, invert, rigid, skew, transform
 
 _MARGIN = 5  # pixels around the object that are compared too
-_SHOWN = 4  # composites that are kept: a descent's best pose, and the trials of its next step
 
 
 @dataclass(frozen=True)
@@ -99,7 +97,6 @@ class Layers:
     crops: tuple[Crop, ...]
     pixel: float
     """world size of a pixel at the object"""
-    shown: Kept[list[Layer]] = field(init=False, default_factory=lambda: Kept(_SHOWN))
 
     @property
     def old(self) -> Old:
@@ -163,10 +160,7 @@ class Layers:
         return torch.cat([c.placed for c in self.crops])
 
     def show(self, new_from_old: Tensor) -> list[Layer]:
-        """The moved object over the fixed background, per crop (Eqs. 1, 3); the latest ones are kept."""
-        return self.shown.get((new_from_old,), lambda: self._show(new_from_old))
-
-    def _show(self, new_from_old: Tensor) -> list[Layer]:
+        """The moved object over the fixed background, per crop (Eqs. 1, 3)."""
         alone = object_alone(self.sight.field, self.old, self._rays, new_from_old, self._sampler)
         behind, beyond = self._behind
         hidden = self._placed < alone.depth

@@ -41,7 +41,7 @@ from refield.scene.planes import Plane, rough_planes, rough_tops
 OnStage = Callable[[str], None]
 _MUCH_NEW = 0.02  # of a photo's pixels, from which on it is said that no old photo saw what they show
 _OTHER_LIGHT = 2.0  # times brighter or darker, from which on a photo's light is spoken of
-_KNOWS = 0.5  # of its own photos' variance; a field that shows less of it tells no change
+_MISSED = 0.5  # of its own photos' variance; a field that does not show more of it tells no change
 
 
 @dataclass(frozen=True)
@@ -164,9 +164,9 @@ def estimate_change(
 def _detected(
     capture: Capture, field: Field, frames: Sequence[Frame], config: EstimateConfig, models: Models
 ) -> _Scene:
-    views = [_placed(field, f, config) for f in frames]
     survey = [look.view_of(field, f, config.max_pixels) for f in look.spread_out(capture.frames, config.survey)]
     _check_knows(survey)
+    views = [_placed(field, f, config) for f in frames]
     errors = detect.errors(survey, Memory.of(field, capture.train), config.detect)
     changed = detect.changes(views, errors, config.detect)
     shares = [float(c.mask.mean()) for c in changed]
@@ -188,9 +188,10 @@ def _detected(
 
 def _check_knows(survey: Sequence[View]) -> None:
     """Refuse a field whose fit ended before it showed its own photos."""
-    missed = [((v.photo - v.rgb) ** 2).mean() / max(v.photo.var(axis=(0, 1)).mean(), 1e-6) for v in survey]
-    if np.median(missed) > 1 - _KNOWS:
-        what = f"it shows its own photos hardly better than one colour would ({100 * (1 - np.median(missed)):.0f} %)"
+    of_each = [((v.photo - v.rgb) ** 2).mean() / max(v.photo.var(axis=(0, 1)).mean(), 1e-6) for v in survey]
+    missed = float(np.median(of_each))
+    if missed > _MISSED:
+        what = f"it shows its own photos hardly better than one colour would ({100 * (1 - missed):.0f} %)"
         raise InputError("the field", what, "go on with its fit: refield train WORK --more")
 
 

@@ -124,7 +124,7 @@ class _GpuFit:
         looks: list[float] = []
         due = self.config.check_every
         graph, step = self._captured(0)
-        while progress_of(self.config, step, time.perf_counter() - self.began) < 1:
+        while self._progress(step) < 1:
             stage = self.photos.stage(graph.progress)
             step = self._round(graph, step)
             self.step, samples = step, int(graph.samples)
@@ -171,9 +171,12 @@ class _GpuFit:
         self._set_rate(step)
         return graph, step + graph.capture()
 
+    def _progress(self, step: int) -> float:
+        return progress_of(self.config, step, time.perf_counter() - self.began)
+
     def _expose(self, step: int) -> float:
         """How far the fit is; and find out, when that is due, whether photos are exposed alike."""
-        progress = progress_of(self.config, step, time.perf_counter() - self.began)
+        progress = self._progress(step)
         if self.photos.may_expose(max(step / self.config.steps, progress / 2)):
             self.photos.exposing = self.judge.tells_exposures(self.model)
             self.model.train()
@@ -182,14 +185,14 @@ class _GpuFit:
     def _learn(self, graph: GraphedStep, step: int) -> None:
         """What a replay found goes to the photos; outside of the graph, since it solves equations."""
         assert graph.asked is not None and graph.found is not None
-        progress = progress_of(self.config, step, time.perf_counter() - self.began)
+        progress = self._progress(step)
         self.photos.learn(graph.asked, graph.found, progress, rate_factor(progress))
 
     def _set_rate(self, step: int) -> None:
         self.descent.rate.fill_(self._rate(step))
 
     def _rate(self, step: int) -> float:
-        return self.config.rate * rate_factor(progress_of(self.config, step, time.perf_counter() - self.began))
+        return self.config.rate * rate_factor(self._progress(step))
 
     def _resized(self, samples: int) -> bool:
         """Choose the rays of a step and the lattice anew, after a step with so many samples; whether either changed."""
