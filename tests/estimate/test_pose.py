@@ -163,7 +163,7 @@ def test_colour_slopes_with_respect_to_the_pose_are_those_of_finite_differences(
         h = 0.6 * r.pixel if k < 3 else 0.6 * r.pixel / r.old.radius
         twist = torch.zeros(6, dtype=torch.float64)
         twist[k] = h
-        plus, minus = (residuals(r, r.moved(TRUE, s * twist), 1.5, config, slopes=False).error for s in (1, -1))
+        plus, minus = (residuals(r, r.moved(TRUE, s * twist), 1.5, config).error for s in (1, -1))
         measured = ((plus - minus) / (2 * h))[inner].reshape(-1)
         said = now.jacobian[..., k][inner].reshape(-1)
         cosine = float((measured * said).sum() / (measured.norm() * said.norm()))

@@ -106,11 +106,11 @@ class Old:
     instead: Old | None = None
     """what it may be with its surroundings, where it cannot be told from them; what fits the new photos says which"""
 
-    @property
+    @cached_property
     def centre(self) -> Array:
         return self.lattice.centres[self.voxels].mean(0)
 
-    @property
+    @cached_property
     def radius(self) -> float:
         """rms distance of its voxels from the centre, scaled to a ball's radius."""
         p = self.lattice.centres[self.voxels]

@@ -6,7 +6,9 @@ old field shows without the object. Six numbers are improved by damped Gauss–N
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -90,8 +92,13 @@ class Linear:
     """(M, 3) blurred colour differences"""
     weight: Tensor
     """(M,) of each pixel"""
-    jacobian: Tensor
-    """(M, 3, 6) by the twist about the object's centre that left-multiplies"""
+    slopes: Callable[[], Tensor]
+    """what makes the `jacobian`"""
+
+    @cached_property
+    def jacobian(self) -> Tensor:
+        """(M, 3, 6) by the twist about the object's centre that left-multiplies; most poses are never asked for it."""
+        return self.slopes()
 
     def normal(self, robust: float, unit: Tensor) -> tuple[Tensor, Tensor]:
         """Gauss–Newton's matrix (6, 6) and gradient (6,), in twists measured in ``unit``."""
@@ -122,29 +129,32 @@ def relit(shown: Layer, crop: Crop, sigma: float, share: float) -> Layer:
     return replace(shown, own=lit, rgb=shown.rgb - shown.own + lit)
 
 
-def _evened(image: Tensor, inner: NDArray[np.float32], sigma: float) -> Tensor:
-    """Colour differences (n, 3) without their mean over ``sigma`` pixels inside the object (H, W)."""
+def _evened(images: Tensor, inner: NDArray[np.float32], sigma: float) -> Tensor:
+    """Colour differences (n, K) without their mean over ``sigma`` pixels inside the object (H, W)."""
     h, w = inner.shape
-    smooth = pixels.blur(image.reshape(h, w, 3).numpy() * inner[..., None], sigma)
+    smooth = pixels.blur(images.reshape(h, w, -1).numpy() * inner[..., None], sigma)
     smooth = smooth / np.maximum(pixels.blur(inner, sigma), 1e-3)[..., None] * inner[..., None]
-    return torch.from_numpy(smooth.reshape(-1, 3))
+    return torch.from_numpy(smooth.reshape(h * w, -1))
 
 
-def residuals(ready: Layers, new_from_old: Tensor, sigma: float, config: RefineConfig, slopes: bool = True) -> Linear:
-    """Blurred colour differences over all crops, and their derivatives by the six numbers of a twist."""
-    shown = ready.show(new_from_old)
-    parts = [_residuals(ready, c, s, new_from_old, sigma, config, slopes) for c, s in zip(ready.crops, shown)]
-    return Linear(*(torch.cat([p[k] for p in parts]).double() for k in range(3)))
+def residuals(ready: Layers, new_from_old: Tensor, sigma: float, config: RefineConfig) -> Linear:
+    """Blurred colour differences over all crops, and what their derivatives by the six numbers of a twist are."""
+    parts = [
+        _residuals(ready, crop, shown, new_from_old, sigma, config)
+        for crop, shown in zip(ready.crops, ready.show(new_from_old))
+    ]
+    errors, weights, slopes = zip(*parts)
+    return Linear(
+        torch.cat(errors).double(), torch.cat(weights).double(), lambda: torch.cat([s() for s in slopes]).double()
+    )
 
 
 def _residuals(
-    ready: Layers, crop: Crop, shown: Layer, pose: Tensor, sigma: float, c: RefineConfig, slopes: bool
-) -> tuple[Tensor, Tensor, Tensor]:
+    ready: Layers, crop: Crop, shown: Layer, pose: Tensor, sigma: float, c: RefineConfig
+) -> tuple[Tensor, Tensor, Callable[[], Tensor]]:
     shading = c.shading * ready.apparent
     shown = relit(shown, crop, shading, c.shaded)
     ok = ((crop.known | (shown.opacity > 0.9)) & ~shown.hidden)[:, None]
-    zero = torch.zeros_like(shown.rgb)
-    e = _blurred(torch.where(ok, shown.rgb - crop.photo, zero), crop.shape, sigma)
     # an outline is where shape, shadow and haze are wrong together: it counts, but little
     alpha = shown.opacity.reshape(crop.shape).numpy()
     inner = pixels.erode(alpha > 0.9, 1 + int(sigma > 1))
@@ -152,13 +162,16 @@ def _residuals(
     bare = (ready.sides(crop, shown, pose) < 0) & (alpha.reshape(-1) > 0.8)
     weight[torch.from_numpy(bare)] = 0.0  # a face that nobody saw: its colours are accidents
     within = inner.astype(np.float32)
-    e = e - c.shaded * _evened(e, within, shading)
-    if not slopes:
-        return e, weight, zero[:, :1]
-    flow = ready.flow(crop, shown, pose) * ok[..., None]
-    columns = [_blurred(flow[..., k], crop.shape, sigma) for k in range(6)]
-    columns = [k - c.shaded * _evened(k, within, shading) for k in columns]
-    return e, weight, torch.stack(columns, -1)
+
+    def compared(images: Tensor) -> Tensor:
+        blurred = _blurred(images, crop.shape, sigma)
+        return blurred - c.shaded * _evened(blurred, within, shading)
+
+    def slopes() -> Tensor:
+        flow = ready.flow(crop, shown, pose) * ok[..., None]
+        return compared(flow.reshape(len(flow), -1)).reshape(-1, 3, 6)
+
+    return compared(torch.where(ok, shown.rgb - crop.photo, 0.0)), weight, slopes
 
 
 def shared_out(rays: int, photos: int) -> int:
@@ -208,9 +221,9 @@ def _descend(
     return pose, now.normal(c.robust, unit)[0]
 
 
-def _blurred(image: Tensor, shape: tuple[int, int], sigma: float) -> Tensor:
-    """(n, 3) -> (n, 3)."""
-    return torch.from_numpy(pixels.blur(image.reshape(*shape, 3).numpy(), sigma).reshape(-1, 3))
+def _blurred(images: Tensor, shape: tuple[int, int], sigma: float) -> Tensor:
+    """(n, K) -> (n, K)."""
+    return torch.from_numpy(pixels.blur(images.reshape(*shape, -1).numpy(), sigma).reshape(images.shape))
 
 
 def _variance(ready: Layers, at: Linear, c: RefineConfig) -> float:
@@ -227,7 +240,7 @@ def _described(
 ) -> PoseChange:
     """Covariance, what cannot be seen, and how much the composite explains."""
     sigma, c = level
-    now = residuals(ready, pose, sigma, c, slopes=False)
+    now = residuals(ready, pose, sigma, c)
     size = (now.error**2).sum(-1).sqrt()[now.weight > 0.5]
     noise = (float(size.median()) if len(size) else 1.0) * 1.2 + _SURE
     values, vectors = torch.linalg.eigh(hessian)
