@@ -263,7 +263,7 @@ def test_looking_past_what_is_hidden_is_as_if_whole_rays_were_asked(stage):
     for some in (rays, up):
         samples = BEFORE.sampler(some)
         at = samples.positions(some)
-        truth = shaded(BEFORE, at, torch.where(hidden(at[0]), 0.0, BEFORE.density(at[0])), samples)
+        truth = shaded(BEFORE, at, torch.where(stage.old.haze.contains(at[0]), 0.0, BEFORE.density(at[0])), samples)
         seen = see(BEFORE, some, hidden)
         torch.testing.assert_close(seen.rgb, truth.rgb, rtol=0, atol=2e-3)
         torch.testing.assert_close(seen.depth, truth.depth, rtol=1e-5, atol=1e-5)

@@ -127,6 +127,31 @@ def test_march(fill: float, visible: bool, masked: bool) -> None:
     assert close.float().mean() > 0.995 if len(close) else fill == 0.0
 
 
+@pytest.mark.parametrize("inside", [False, True])
+@pytest.mark.parametrize("masks", [1, 2])
+def test_march_within(inside: bool, masks: int) -> None:
+    """Only samples in every mask, or in none, are there, and end a ray."""
+    torch.manual_seed(7)
+    grid = (torch.rand(32, 32, 32) < 0.7).to(torch.uint8)
+    origins = torch.randn(300, 3) * 2
+    rays = (origins, torch.nn.functional.normalize(torch.randn(300, 3) - origins, dim=-1), torch.zeros(300))
+    space, lattice = (torch.tensor([0.1, -0.2, 0.3]), 1.5), (0.01, 60.0, 0.02)
+    net = (torch.randn(3, 1 << 12, 2), (8, 16, 64), torch.randn(32, 6), torch.randn(32) * 0.1)
+    shapes = torch.tensor([[12, 9, 10], [5, 7, 6]])[:masks]
+    boxes = torch.tensor([[[-1.0, -0.8, -1.2], [0.9, 1.1, 1.0]], [[-0.5, -0.5, -0.6], [1.4, 0.9, 0.7]]])[:masks]
+    within = reference.Within(boxes, shapes, torch.tensor([0, 1080])[:masks], torch.rand(1290), inside)
+    asked = (rays, space, grid, lattice, net, 7.0, None)
+    truth, fast = (twin.march_within(*asked, within) for twin in (reference, cpu))
+    every = reference.march_visible(*asked)
+    assert len(truth[0]) > 100 and len(truth[0]) != len(every[0])
+    difference = (fast[3].diff() - truth[3].diff()).abs()  # a midpoint on a face may fall either way
+    assert int(difference.sum()) <= max(2, 0.002 * len(truth[0]))
+    same = difference == 0
+    ids_t, ids_f = (torch.repeat_interleave(same, o.diff()) for o in (truth[3], fast[3]))
+    for t, f in zip(truth[:3], fast[:3]):
+        assert ((t[ids_t] - f[ids_f]).abs() < 1e-2 * (1 + t[ids_t].abs())).float().mean() > 0.99
+
+
 def test_adam_and_scatter_max() -> None:
     torch.manual_seed(6)
     grad = torch.randn(2, 64, 2) * (torch.rand(2, 64, 2) < 0.5)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from refield.estimate.look import Seen, near_to_far, shaded
+from refield.estimate.look import Seen, reached, shaded
 from refield.estimate.objects import Old
 from refield.field.radiance import Field
 from refield.field.sampling import OccupancySampler
@@ -48,13 +48,9 @@ def object_alone(
     end = float(far[hit].max()) / sampler.contraction.radius  # beyond it there is nothing to look for
     asked, along = (field, old.outlook.held) if old.source is None else (old.source, None)
 
-    def density(x: Tensor) -> Tensor:
-        own = grid.contains(x) if old.source is None else grid.contains(x) & old.source.grid.contains(x)
-        mine = own.nonzero()[:, 0]
-        return x.new_zeros(len(x)).index_copy(0, mine, asked.density(x[mine]))
-
+    grids = (grid,) if old.source is None else (grid, old.source.grid)
     with torch.no_grad():
-        samples, sigmas = near_to_far(density, replace(sampler, far=min(end, sampler.far))(there), there)
+        samples, sigmas = reached(asked, replace(sampler, far=min(end, sampler.far)), there, grids, inside=True)
         seen = shaded(asked, samples.positions(there), sigmas, samples, along)
     rgb[hit], depth[hit], opacity[hit] = seen.rgb, seen.depth, seen.opacity
     return Seen(rgb, depth, opacity)

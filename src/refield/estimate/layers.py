@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from torch import Tensor
 from refield.estimate.alone import object_alone, sampler_around
 from refield.estimate.detail import Detail
 from refield.estimate.explain import Compared
-from refield.estimate.look import Hidden, Seen, pixel_slopes, see
+from refield.estimate.look import Array, Hidden, Seen, pixel_slopes, see
 from refield.estimate.objects import Old, box_in, patch_rays
 from refield.estimate.past import Past
 from refield.field.radiance import Field
@@ -125,13 +126,18 @@ class Layers:
 
     @cached_property
     def _known(self) -> bool:
-        """Whether the field was rendered at the same size already."""
-        return all(self.sight.past[c.photo_index].view.camera == c.camera for c in self.crops)
+        """Whether the field was rendered at the same size already, or a larger one."""
+        return all(c.camera.width <= self.sight.past[c.photo_index].view.camera.width for c in self.crops)
 
-    def _cut(self, image_of: Callable[[Past], NDArray[np.float32]]) -> Tensor:
-        """The crops' part of images that are known, (N, ...)."""
-        found = [(image_of(self.sight.past[c.photo_index]), c.box) for c in self.crops]
-        parts = [image[y0:y1, x0:x1].reshape(-1, *image.shape[2:]) for image, (x0, y0, x1, y1) in found]
+    def _cut(self, image_of: Callable[[Past], Array]) -> Tensor:
+        """The crops' part of pictures (H, W, 3) that are known, (N, 3)."""
+        parts = []
+        for c in self.crops:
+            x0, y0, x1, y1 = c.box
+            image: Array = image_of(self.sight.past[c.photo_index])
+            if image.shape[:2] != (c.camera.height, c.camera.width):  # as the photo is scaled down
+                image = cv2.resize(image, (c.camera.width, c.camera.height), interpolation=cv2.INTER_AREA)
+            parts.append(image[y0:y1, x0:x1].reshape(-1, 3))
         return torch.from_numpy(np.concatenate(parts))
 
     @cached_property
@@ -148,7 +154,7 @@ class Layers:
     def _behind(self) -> tuple[Tensor, Tensor]:
         """Colour (N, 3) and depth (N,) without the objects."""
         if self._known:
-            return self._cut(lambda p: p.rgb), self._cut(lambda p: p.beyond)
+            return self._cut(lambda p: p.rgb), torch.cat([c.beyond for c in self.crops])
         hidden = Hidden(tuple(o.haze for o in self.sight.olds))
         near = hidden.meets(self._rays).nonzero()[:, 0]
         seen = self._plain.with_rows(near, see(self.sight.field, self._rays[near], hidden))

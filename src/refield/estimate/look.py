@@ -16,9 +16,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from refield.field.kernels.reference import Within
 from refield.field.radiance import Field
 from refield.field.render import CHUNK, visible_samples
-from refield.field.sampling import STOP
+from refield.field.sampling import STOP, OccupancySampler
 from refield.field.volrend import Samples, composite, weights
 from refield.field.warp import crosses, outline
 from refield.scene.camera import Camera
@@ -44,13 +45,6 @@ class Hidden:
     @cached_property
     def _boxes(self) -> list[Tensor]:
         return [outline(g) for g in self.grids]
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """World points (S, 3) -> (S,) bool."""
-        found = torch.zeros(len(x), dtype=torch.bool)
-        for grid in self.grids:
-            found |= grid.contains(x)
-        return found
 
     def meets(self, rays: Rays) -> Tensor:
         """Whether each ray crosses a box around what is hidden, (N,) bool."""
@@ -102,15 +96,41 @@ def _see(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
         at = samples.positions(rays)
         return shaded(field, at, field.density(at[0]), samples)
 
-    def density(x: Tensor) -> Tensor:
-        left = (~hidden(x)).nonzero()[:, 0]
-        return x.new_zeros(len(x)).index_copy(0, left, field.density(x[left]))
-
-    samples, sigmas = near_to_far(density, field.sampler(rays), rays)
+    samples, sigmas = reached(field, field.sampler, rays, hidden.grids, inside=False)
     return shaded(field, samples.positions(rays), sigmas, samples)
 
 
-def near_to_far(density: Callable[[Tensor], Tensor], every: Samples, rays: Rays) -> tuple[Samples, Tensor]:
+def reached(
+    field: Field, sampler: OccupancySampler, rays: Rays, grids: Sequence[OccupancyGrid], inside: bool
+) -> tuple[Samples, Tensor]:
+    """Those of a field's samples that light reaches if there are only those in every one of some grids, or in none of
+    them, where ``sampler`` looks; and their densities (S,)."""
+    own: Callable[..., tuple[Samples, Tensor]] | None = getattr(field, "samples_within", None)
+    if own is not None:
+        return own(sampler, rays, _masks(grids, inside))
+
+    def density(x: Tensor) -> Tensor:
+        meant = torch.ones(len(x), dtype=torch.bool)
+        for grid in grids:
+            meant &= grid.contains(x) == inside
+        rows = meant.nonzero()[:, 0]
+        return x.new_zeros(len(x)).index_copy(0, rows, field.density(x[rows]))
+
+    return _near_to_far(density, sampler(rays), rays)
+
+
+def _masks(grids: Sequence[OccupancyGrid], inside: bool) -> Within:
+    sizes = torch.tensor([g.values.numel() for g in grids])
+    return Within(
+        torch.stack([g.aabb for g in grids]).float(),
+        torch.tensor([tuple(g.values.shape) for g in grids]),
+        sizes.cumsum(0) - sizes,
+        torch.cat([g.values.flatten() for g in grids]).float(),
+        inside,
+    )
+
+
+def _near_to_far(density: Callable[[Tensor], Tensor], every: Samples, rays: Rays) -> tuple[Samples, Tensor]:
     """Those of the samples that light reaches, and their densities (S,); asked for some at a time, until a ray has
     ended: most of what a field holds lies behind its surfaces."""
     first, count = every.ray_offsets[:-1], every.ray_offsets.diff()

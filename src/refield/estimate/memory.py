@@ -15,10 +15,13 @@ from refield.estimate.carve_kernels import Window, count_on_surface, packed
 from refield.estimate.look import Array, View, see, spread_out
 from refield.field.radiance import Field
 from refield.scene.capture import Frame, camera_rays
+from refield.vision import pixels
+from refield.vision.pixels import Mask
 
 _RAYS = 200_000  # through the field, for all old photos together
 _FEWEST = 1000  # of one photo: with less its pixels are wider than things
 _SLACK = 1.5  # pixels' widths that a point may be off a surface; one that is looked at aslant is that far off
+_ACROSS = 5  # pixels over which the middle count is taken
 _FAR = 100.0  # times the farthest surface: there an empty pixel is asked, and seen where other photos are empty too
 
 
@@ -49,12 +52,18 @@ class Memory:
         finite = depths[np.isfinite(depths)]
         return Memory(lenses, depths, np.array(slack), _FAR * float(finite.max(initial=1.0)))
 
-    def times_seen(self, view: View, depth: Array | None = None) -> NDArray[np.uint16]:
-        """How many old photos saw what is under each pixel at ``depth`` (H, W), the view's own by default. (H, W)"""
+    def times_seen(self, view: View, depth: Array | None = None, where: Mask | None = None) -> NDArray[np.uint16]:
+        """How many old photos saw what is under each pixel at ``depth`` (H, W), the view's own by default. (H, W)
+
+        ``where`` (H, W): the pixels that are asked for; of others nothing is said.
+        """
         depth = view.depth if depth is None else depth
-        reach = np.where(np.isfinite(depth), depth, self.far)
-        points = (view.centre + view.directions * reach[..., None]).reshape(-1, 3).astype(np.float32)
-        found = np.zeros(len(points), np.uint16)
-        count_on_surface(points, self.lenses, self.depths, self.slack, self.far / 2, found)
+        asked = np.ones(view.shape, bool) if where is None else pixels.dilate(where, _ACROSS // 2)
+        reach = np.where(np.isfinite(depth), depth, self.far)[asked]
+        points = (view.centre + view.directions[asked] * reach[:, None]).astype(np.float32)
+        counts = np.zeros(len(points), np.uint16)
+        count_on_surface(points, self.lenses, self.depths, self.slack, self.far / 2, counts)
+        found = np.zeros(view.shape, np.uint16)
+        found[asked] = counts
         # a pixel of an old photo across an edge has one of the two depths
-        return np.asarray(cv2.medianBlur(found.reshape(view.shape), 5), np.uint16)
+        return np.asarray(cv2.medianBlur(found, _ACROSS), np.uint16)

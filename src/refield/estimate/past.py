@@ -92,20 +92,20 @@ def _look_past(
     hit = np.abs(np.where(np.isfinite(depth), depth, 0) - np.where(np.isfinite(view.depth), view.depth, 0))
     gone = was & (hit > tolerance(view, np.where(np.isfinite(view.depth), view.depth, 0), carving))
     gone = pixels.close(gone, 3)
-    guess = was & ((memory.times_seen(view, depth) == 0) | _beneath(view, depth, olds))
+    guess = was & ((memory.times_seen(view, depth, was) == 0) | _beneath(view, depth, olds, was))
     known = ~pixels.dilate(pixels.close(guess, 3), 1)
     diff = difference(view, rgb, config)
     return Past(c, rgb, depth, gone, known, diff, np.zeros(view.shape, bool), depth)
 
 
-def _beneath(view: View, depth: Array, olds: Sequence[Old]) -> Mask:
-    """Pixels whose surface at ``depth`` touches one of the objects: nobody ever saw what they stood on."""
-    finite = np.isfinite(depth)
-    points = view.centre + view.directions * np.where(finite, depth, 0)[..., None]
+def _beneath(view: View, depth: Array, olds: Sequence[Old], where: Mask) -> Mask:
+    """Those of the pixels whose surface at ``depth`` touches one of the objects: nobody ever saw what they stood on."""
+    asked = where & np.isfinite(depth)
+    points = view.centre + view.directions[asked] * depth[asked][:, None]
     out = np.zeros(view.shape, bool)
     for old in olds:
-        out |= old.lattice.holds(grown(old.voxels, 4), points)
-    return out & finite
+        out[asked] |= old.lattice.holds(grown(old.voxels, 4), points)
+    return out
 
 
 def silhouette(view: View, old: Old) -> Mask:

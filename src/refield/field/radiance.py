@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from refield.field import kernels
 from refield.field.encoding import Contraction, HashGrid, geometric_levels
-from refield.field.kernels.reference import DensityNet, Networks, truncated_exp
+from refield.field.kernels.reference import DensityNet, Networks, Within, truncated_exp
 from refield.field.networks import weight
 from refield.field.sampling import STOP, OccupancySampler
 from refield.field.stored import State, read_field, sampler_from, state_of, write_field
@@ -116,6 +116,11 @@ class HashField(nn.Module):
     def samples(self, rays: Rays, jitter: bool = False) -> Samples:
         """Where to evaluate the field along rays: the sampler's places, ended behind the first opaque surface."""
         return self.sampler.visible(rays, self.density_net, jitter)
+
+    def samples_within(self, sampler: OccupancySampler, rays: Rays, within: Within) -> tuple[Samples, Tensor]:
+        """Those of the samples ``within`` that light reaches, if there is nothing else, where ``sampler`` looks, which
+        looks nowhere but where the field's does; and their densities (S,)."""
+        return sampler.within(rays, self.density_net, within)
 
     def rendered(self, rays: Rays, chunk: int) -> Rendering:
         """What rays see, without gradients: `refield.field.render.render_rays`, ``chunk`` rays at once."""

@@ -12,7 +12,7 @@ from refield.field import kernels
 from refield.field.encoding import Contraction
 from refield.field.kernels.masks import marked, part_of
 from refield.field.kernels.onward import Span
-from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
+from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space, Within
 from refield.field.volrend import Samples
 from refield.scene.capture import Rays
 
@@ -64,6 +64,12 @@ class OccupancySampler:
         """As a call, but nothing behind the sample where the optical depth passes ``stop``."""
         with torch.no_grad():
             return Samples(*kernels.march_visible(*self._question(rays, jitter), net, stop, self.fine))
+
+    def within(self, rays: Rays, net: DensityNet, within: Within) -> tuple[Samples, Tensor]:
+        """As `visible`, but only of the samples that are ``within``; and their densities (S,)."""
+        with torch.no_grad():
+            t0, t1, sigmas, offsets = kernels.march_within(*self._question(rays, False), net, STOP, self.fine, within)
+            return Samples(t0, t1, offsets), sigmas
 
     def onward(self, rays: Rays, span: Span, most: int) -> tuple[Tensor, Tensor, Tensor]:
         """The next samples of N rays, ``most`` of each: see `kernels.next_samples`."""

@@ -97,7 +97,7 @@ def cell_along(x: float, low: float, high: float, nodes: int) -> tuple[int, floa
 
 
 @njit(**_JIT)
-def _above(values: _Array, aabb: _Array, level: float, x: float, y: float, z: float) -> bool:
+def above(values: _Array, aabb: _Array, level: float, x: float, y: float, z: float) -> bool:
     """Whether the trilinear value at a place is above a level; False outside."""
     i, u = cell_along(x, aabb[0, 0], aabb[1, 0], values.shape[0])
     j, v = cell_along(y, aabb[0, 1], aabb[1, 1], values.shape[1])
@@ -114,7 +114,7 @@ def _above(values: _Array, aabb: _Array, level: float, x: float, y: float, z: fl
 @njit(parallel=True, **_JIT)
 def _in_grid(x: _Array, aabb: _Array, values: _Array, level: float, out: _Array) -> None:
     for s in prange(len(x)):
-        out[s] = _above(values, aabb, level, x[s, 0], x[s, 1], x[s, 2])
+        out[s] = above(values, aabb, level, x[s, 0], x[s, 1], x[s, 2])
 
 
 @njit(**_JIT)
@@ -161,7 +161,7 @@ def _meet_grid(
             for place in range(places):
                 t = near + (far - near) * (place + 0.5) / places
                 x, y = origins[n, 0] + directions[n, 0] * t, origins[n, 1] + directions[n, 1] * t
-                if _above(values, aabb, level, x, y, origins[n, 2] + directions[n, 2] * t):
+                if above(values, aabb, level, x, y, origins[n, 2] + directions[n, 2] * t):
                     found = True
                     break
         out[n] = found

@@ -24,6 +24,7 @@ from refield.field.kernels.reference import (
     Space,
     Stepped,
     Unwanted,
+    Within,
 )
 
 
@@ -105,6 +106,20 @@ def march_visible(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.march_visible`."""
     return _twin(grid).march_visible(rays, space, grid, lattice, net, stop, fine)
+
+
+def march_within(
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    net: DensityNet,
+    stop: float,
+    fine: Tensor | None,
+    within: Within,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See `reference.march_within`."""
+    return _twin(grid).march_within(rays, space, grid, lattice, net, stop, fine, within)
 
 
 def render(

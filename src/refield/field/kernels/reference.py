@@ -16,6 +16,7 @@ from torch import Tensor
 from refield.field.kernels.masks import marked, part_of
 from refield.field.kernels.masks import narrow as narrow
 from refield.field.kernels.masks import note as note
+from refield.scene.inside import trilinear
 
 Rays3 = tuple[Tensor, Tensor, Tensor]
 """origins (N, 3), unit directions (N, 3), jitter (N,) in [0, 1) that shifts each ray's lattice"""
@@ -295,6 +296,47 @@ def march_visible(
     keep = _exclusive_sum(sigma * (t1 - t0), offsets) < stop
     counts = torch.zeros(len(offsets) - 1, dtype=torch.long, device=ids.device).index_add(0, ids, keep.long())
     return t0[keep], t1[keep], offsets_of(counts)
+
+
+class Within(NamedTuple):
+    """Masks of objects: trilinear values at nodes, of which more than a half is inside, one mask after the other."""
+
+    boxes: Tensor
+    """(G, 2, 3) float32 world, corner to corner of each mask's nodes"""
+    shapes: Tensor
+    """(G, 3) int64"""
+    firsts: Tensor
+    """(G,) int64, the row of each mask's first node"""
+    values: Tensor
+    """(K,) float32 at all nodes"""
+    inside: bool
+    """whether the samples are meant that are in every mask, or those in none"""
+
+
+def march_within(
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    net: DensityNet,
+    stop: float,
+    fine: Tensor | None,
+    within: Within,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """As :func:`march_visible`, but only of the samples that are ``within``, and with their densities: t_starts (S,),
+    t_ends (S,), densities (S,) per world unit, offsets (N + 1,)."""
+    origins, directions, _ = rays
+    t0, t1, offsets = march(rays, space, grid, lattice, fine)
+    ids = _ray_ids(offsets)
+    x = origins[ids] + directions[ids] * ((t0 + t1) / 2)[:, None]
+    sigma = torch.exp(hash_density((contract(x, *space) + 2) / 4, net).clamp(max=15)) / space[1]
+    meant = torch.ones(len(x), dtype=torch.bool, device=x.device)
+    for box, shape, first in zip(within.boxes, within.shapes.tolist(), within.firsts.tolist()):
+        nodes = within.values[first : first + shape[0] * shape[1] * shape[2]].reshape(shape)
+        meant &= (trilinear(x, box, nodes) > 0.5) == within.inside
+    keep = meant & (_exclusive_sum(torch.where(meant, sigma * (t1 - t0), 0.0), offsets) < stop)
+    counts = torch.zeros(len(offsets) - 1, dtype=torch.long, device=ids.device).index_add(0, ids, keep.long())
+    return t0[keep], t1[keep], sigma[keep], offsets_of(counts)
 
 
 def render(

@@ -7,7 +7,7 @@ sums are over a fixed number of groups: results are the same, bit for bit, for e
 from refield.field.kernels.cpu.cells import narrow, note
 from refield.field.kernels.cpu.encoding import hash_encode
 from refield.field.kernels.cpu.lights import relight
-from refield.field.kernels.cpu.marching import hash_density, march, march_visible
+from refield.field.kernels.cpu.marching import hash_density, march, march_visible, march_within
 from refield.field.kernels.cpu.networks import hash_field
 from refield.field.kernels.cpu.onward import blend, next_samples, render_until, shown_on
 from refield.field.kernels.cpu.optimiser import adam, keep, observe, scatter_max
@@ -28,6 +28,7 @@ __all__ = [
     "keep",
     "march",
     "march_visible",
+    "march_within",
     "narrow",
     "next_samples",
     "note",

@@ -20,10 +20,18 @@ from refield.field.kernels.cpu.networks import padded
 from refield.field.kernels.cpu.simd import JIT, exp, product
 from refield.field.kernels.cpu.walk import next_sample, start
 from refield.field.kernels.onward import Way
-from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
+from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space, Within
+from refield.scene.inside import above
 
 _ZERO = np.float32(0)
 _BLOCK = 128  # samples whose hidden layer is held at once
+_ALL = (
+    np.zeros((0, 2, 3), np.float32),
+    np.zeros((0, 3), np.int64),
+    np.zeros(0, np.int64),
+    np.zeros(0, np.float32),
+    False,
+)
 _NO_WAY = (*(np.zeros(0, np.float32) for _ in range(3)), np.zeros((0, 0, 0), np.uint8))
 _ROOM = 32  # samples a ray that are made room for at first
 
@@ -115,10 +123,45 @@ def _raw_density(features, first, n, sizes, w_in, w_out, x, hidden, raw):  # typ
 
 
 @njit(**JIT)
-def _wave_part(begin, end, rays, space, grids, lattice, net, way, arena):  # type: ignore[no-untyped-def]
+def _meant(x, y, z, within):  # type: ignore[no-untyped-def]
+    """Whether a sample at a place is ``within``, see `reference.Within`."""
+    boxes, shapes, firsts, values, inside = within
+    for g in range(len(boxes)):
+        many = shapes[g, 0] * shapes[g, 1] * shapes[g, 2]
+        nodes = values[firsts[g] : firsts[g] + many].reshape((shapes[g, 0], shapes[g, 1], shapes[g, 2]))
+        if above(nodes, boxes[g], np.float32(0.5), x, y, z) != inside:
+            return False
+    return True
+
+
+@njit(**JIT)
+def _sift(begin, m, rays, within, alive, wave, aside):  # type: ignore[no-untyped-def]
+    """Keep those of a wave's m samples that are ``within``; the rays of the others come to ``aside``. How many each."""
+    t0, t1, unit = wave
+    origins, directions, _ = rays
+    kept, others = 0, 0
+    for a in range(m):
+        r, mid = alive[a], (t0[a] + t1[a]) / np.float32(2)
+        x = origins[begin + r, 0] + directions[begin + r, 0] * mid
+        y = origins[begin + r, 1] + directions[begin + r, 1] * mid
+        z = origins[begin + r, 2] + directions[begin + r, 2] * mid
+        if _meant(x, y, z, within):
+            alive[kept], t0[kept], t1[kept] = r, t0[a], t1[a]
+            for c in range(3):
+                unit[kept, c] = unit[a, c]
+            kept += 1
+        else:
+            aside[others] = r
+            others += 1
+    return kept, others
+
+
+@njit(**JIT)
+def _wave_part(begin, end, rays, space, grids, lattice, net, way, within, arena):  # type: ignore[no-untyped-def]
     """March rays ``begin : end``; the samples, wave by wave, into ``arena``. Returns how many, or -1 without room.
 
     ``way`` is what `onward.Way` says, or empty arrays; where rays came to is written over its ``t`` and ``depth``.
+    ``within``: what `reference.Within` says, or empty arrays.
     """
     tables, resolutions, w_in, w_out, stop = net
     t0, t1, owner, unit, features = arena
@@ -126,7 +169,7 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, way, arena):  # typ
     n, step = end - begin, np.float32(lattice[2])
     lines, t, tau = np.empty((n, 11), np.float32), np.empty(n, np.float32), np.zeros(n, np.float32)
     far = np.full(n, np.float32(lattice[1]))
-    alive, lanes = np.arange(n), new_lanes()
+    alive, aside, lanes = np.arange(n), np.empty(n if len(within[0]) > 0 else 0, np.int64), new_lanes()
     x, hidden = np.zeros((_BLOCK, features.shape[1]), np.float32), np.empty((_BLOCK, w_in.shape[1]), np.float32)
     raw = np.empty(_BLOCK, np.float32)
     pair_features = features.view(np.float64)
@@ -139,7 +182,9 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, way, arena):  # typ
         if total + living > len(t0):
             return -1
         out = (t0[total:], t1[total:], owner[total:], unit[total:])
-        m = next_samples(alive[:living], lines, t, far, step, grids, gone, lanes, out)
+        m, others = next_samples(alive[:living], lines, t, far, step, grids, gone, lanes, out), 0
+        if len(within[0]) > 0:
+            m, others = _sift(begin, m, rays, within, alive, (out[0], out[1], out[3]), aside)
         encode_part(unit, total, total + m, tables, resolutions, pair_features)
         living = 0
         for first in range(0, m, _BLOCK):
@@ -152,6 +197,9 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, way, arena):  # typ
                 if tau[r] < stop:
                     alive[living] = r
                     living += 1
+        for a in range(others):
+            alive[living + a] = aside[a]
+        living += others
         total += m
     if len(under_way) > 0:
         under_way[begin:end], depth[begin:end] = t, tau
@@ -159,12 +207,12 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, way, arena):  # typ
 
 
 @njit(parallel=True, **JIT)
-def _waves(rays, space, grids, lattice, net, way, arena, found):  # type: ignore[no-untyped-def]
+def _waves(rays, space, grids, lattice, net, way, within, arena, found):  # type: ignore[no-untyped-def]
     n, parts = rays[0].shape[0], len(found)
     t0, t1, owner, unit, features = arena
     for p in prange(parts):
         mine = (t0[p], t1[p], owner[p], unit[p], features[p])
-        found[p] = _wave_part(n * p // parts, n * (p + 1) // parts, rays, space, grids, lattice, net, way, mine)
+        found[p] = _wave_part(n * p // parts, n * (p + 1) // parts, rays, space, grids, lattice, net, way, within, mine)
 
 
 @njit(parallel=True, **JIT)
@@ -259,6 +307,7 @@ def marched(
     stop: float,
     fine: Tensor | None = None,
     way: Way | None = None,
+    within: Within | None = None,
 ) -> Marched:
     """The waves, packed. Where rays came to is written over the ``t`` and ``depth`` of a ``way``."""
     arrays, place = _arrays(rays, space)
@@ -269,10 +318,11 @@ def marched(
     room = _ROOM * (n // parts + 1)
     found = np.zeros(parts, np.int64)
     grids = grids_of(grid, fine)
+    meant = _ALL if within is None else (*(array(a) for a in within[:4]), within.inside)
     while True:
         arena = _room("waves", parts, room, width)
         on = _NO_WAY if way is None else (*(array(a).copy() for a in way[:3]), array(way.gone))
-        _waves(arrays, place, grids, lattice, inside, on, arena, found)
+        _waves(arrays, place, grids, lattice, inside, on, meant, arena, found)
         if found.min() >= 0:
             break
         room *= 4
@@ -300,3 +350,37 @@ def march_visible(
     found = marched(rays, space, grid, lattice, net, stop, fine)
     kept = (found.t_starts.copy(), found.t_ends.copy(), found.offsets)
     return torch.from_numpy(kept[0]), torch.from_numpy(kept[1]), torch.from_numpy(kept[2])
+
+
+@njit(parallel=True, **JIT)
+def _densities_at(features, net, radius, out, parts):  # type: ignore[no-untyped-def]
+    """The densities of features (S, F), per world unit, into out (S,)."""
+    _, _, w_in, w_out = net
+    n = len(out)
+    for p in prange(parts):
+        x, hidden = np.zeros((_BLOCK, w_in.shape[0]), np.float32), np.empty((_BLOCK, w_in.shape[1]), np.float32)
+        end = n * (p + 1) // parts
+        for first in range(n * p // parts, end, _BLOCK):
+            some = min(_BLOCK, end - first)
+            raw = out[first : first + some]
+            _raw_density(features, first, some, (features.shape[1], len(w_out)), w_in, w_out, x, hidden, raw)
+            for a in range(some):
+                raw[a] = exp(min(raw[a], np.float32(15))) / radius
+
+
+def march_within(
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    net: DensityNet,
+    stop: float,
+    fine: Tensor | None,
+    within: Within,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See `reference.march_within`."""
+    found = marched(rays, space, grid, lattice, net, stop, fine, within=within)
+    sigmas = torch.empty(len(found.t_starts))
+    _densities_at(found.features, _network(net), np.float32(space[1]), sigmas.numpy(), parts_of(len(sigmas)))
+    t0, t1 = torch.from_numpy(found.t_starts.copy()), torch.from_numpy(found.t_ends.copy())
+    return t0, t1, sigmas, torch.from_numpy(found.offsets)

@@ -29,6 +29,7 @@ from refield.field.kernels.onward import (  # torch's own kernels do for these, 
 )
 from refield.field.kernels.reference import (  # torch's own kernels do for those; nobody trains a helper on a GPU yet
     keep,
+    march_within,
     narrow,
     note,
     woven_step,
@@ -48,6 +49,7 @@ __all__ = [
     "keep",
     "march",
     "march_visible",
+    "march_within",
     "narrow",
     "next_samples",
     "note",
