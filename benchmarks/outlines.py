@@ -3,8 +3,9 @@
     python benchmarks/outlines.py build/gauntlet/SCENE...
 
 Each SCENE is a folder of the gauntlet, with ``data/`` and ``work/``. For every object that truly moved or left: of all
-outlines the one whose pixels cover the object's best (IoU over the new photos' cameras, as the old field shows both);
-and that of the best outline, drawn anew as what went along by the object's true motion.
+outlines the one whose pixels cover the object's best (IoU over the new photos' cameras, as the old field shows both),
+the same among the outlines and their halves, which are offered where an outline fits nowhere; and that of the best
+outline, drawn anew as what went along by the object's true motion.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ from refield.estimate.associate import without
 from refield.estimate.comoving import with_comoving
 from refield.estimate.detect import Changed
 from refield.estimate.objects import Old
+from refield.estimate.outline import ObjectConfig
 from refield.estimate.past import silhouette
+from refield.estimate.split import halves
 from refield.history import state
 from refield.scene.change import ObjectChange, OccupancyGrid
 from refield.scene.load import load_new_photos
@@ -89,16 +92,17 @@ def _pixels_of(grid: OccupancyGrid, c: Changed, within: float) -> NDArray[np.boo
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
-    found: dict[str, list[float]] = {"outlines": [], "by their motion": []}
+    found: dict[str, list[float]] = {"outlines": [], "with halves": [], "by their motion": []}
     for scene in parser.parse_args().scenes:
         seen = outlined(scene / "work", scene / "data" / "after")
         if seen is None:
             continue
         search, olds = seen
         wholes = [o for old in olds for o in (old, old.instead) if o is not None]
+        both = wholes + [half for old in wholes for half, _ in halves(old, ObjectConfig())]
         told = []
         for true in (t for t in true_objects(scene / "data") or () if t.kind != "added"):
-            values = [covered(some, true.grid, search.changed) for some in (wholes, along(search, wholes, true))]
+            values = [covered(some, true.grid, search.changed) for some in (wholes, both, along(search, wholes, true))]
             for kept, value in zip(found.values(), values):
                 kept.append(value)
             told.append(f"{true.kind} " + ", ".join(f"{v:.2f}" for v in values))

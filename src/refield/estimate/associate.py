@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from refield.estimate.arrive import arrivals, newcomers
+from refield.estimate.arrive import arrivals, newcomers, remarkable
 from refield.estimate.detect import Changed
 from refield.estimate.fit import Fit, at_one_place, fit_again, fit_of, left_by
 from refield.estimate.ground import Ground
@@ -91,13 +91,14 @@ def _place(
     guess = cache(lambda k: matched_poses(tried[k], first, ground.survey, ground.matcher))
     while True:
         parts = newcomers(ground, arrivals(ground, views, everyone), views)[: ground.believe.most]
+        left = remarkable(ground, parts, views, places_of(everyone, [(olds[k], c) for k, c in moved.items()]))
         fits: dict[int, Fit] = {}
         # what moved before moves again: a piece of something else is tried only on what that leaves unexplained
         for again in (True, False):
             some = [k for k, old in tried.items() if old.remembered == again and k not in moved and parts]
             tries = {
                 k: fit_again(ground, everyone, views, found[k])
-                or fit_of(ground, olds[k], everyone, views, parts, guess(k))
+                or fit_of(ground, olds[k], everyone, views, (parts, left), guess(k))
                 for k in some
             }
             enough = {k: ground.believe.shown if k in cut else 0.0 for k in some}

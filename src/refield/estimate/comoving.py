@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix, csc_matrix, diags
+from scipy.sparse import csc_matrix, diags
 from scipy.sparse.csgraph import laplacian
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
@@ -32,6 +32,7 @@ from refield.estimate.look import Array
 from refield.estimate.objects import Cloud, Old, Patch, corners_of, look_around
 from refield.estimate.outline import FEWEST_POINTS, carve_solid, free_voxels, seen_as
 from refield.estimate.past import Past
+from refield.estimate.split import alike
 from refield.scene.pose import transform
 from refield.scene.srgb import to_linear, to_srgb
 from refield.vision import pixels
@@ -42,8 +43,6 @@ _SEEN = 2  # old pixels that must show a surface in a voxel
 _UNKNOWN = 0.6  # what a photo costs that shows what nobody knew
 _LIT = 0.3  # and one that shows the same in another light
 _FACING = 0.2  # cosine, from which on a photo shows a surface well enough
-_NEIGHBOURS = 8
-_LOOSE = 1e-6  # weight between neighbours that are nothing alike: the graph stays in one piece
 _STIFF = 20.0  # what neighbours of the usual likeness weigh beside one photo
 
 
@@ -81,7 +80,7 @@ def with_comoving(
         return None
     solid = carve_solid(lattice, patches, ground.shape.through, float((high - low).max())) & free | held
     asked = _asked(ground, old, cloud, past, new_from_old)
-    likely = _walked(_alike(cloud), asked)
+    likely = _walked(alike(cloud), asked)
     nearest = cKDTree(cloud.points).query(lattice.centres[solid])[1]
     voxels = np.zeros_like(solid)
     voxels[solid] = likely[nearest] > 0.5
@@ -116,21 +115,6 @@ def _surfaces(lattice: Lattice, free: Voxels, patches: Sequence[Patch]) -> tuple
     held[tuple(lattice.index(xyz[often])[0].T)] = True
     some = often[:: max(1, -(-len(often) // _POINTS))]
     return Cloud(*(np.ascontiguousarray(a[some], np.float32) for a in (xyz, n, rgb))), held
-
-
-def _alike(cloud: Cloud) -> csc_matrix:
-    """(N, N) how alike neighbouring points are: near, alike in colour and not across a hollow, each beside what
-    is usual on this surface."""
-    count = len(cloud.points)
-    apart, to = (a[:, 1:].ravel() for a in cKDTree(cloud.points).query(cloud.points, _NEIGHBOURS + 1))
-    at = np.repeat(np.arange(count), _NEIGHBOURS)
-    along = (cloud.points[to] - cloud.points[at]) / np.maximum(apart, 1e-12)[:, None]
-    hollow = np.maximum(-((cloud.normals[to] - cloud.normals[at]) * along).sum(-1), 0)
-    lab = pixels.to_lab(cloud.colours[None])[0]
-    unlike = np.linalg.norm(lab[to] - lab[at], axis=-1)
-    cost = sum(d / max(float(d.mean()), 1e-12) for d in (apart, hollow, unlike))
-    weights = coo_matrix((np.exp(-cost) + _LOOSE, (at, to)), (count, count)).tocsc()
-    return weights.maximum(weights.T)
 
 
 def _walked(weights: csc_matrix, asked: _Asked) -> Array:

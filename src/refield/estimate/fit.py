@@ -1,4 +1,5 @@
-"""Where an old object is now: the pose that explains the photos best, of each outline that it may have."""
+"""Where an old object is now: the pose that explains the photos best, of each outline that it may have, and of the two
+things that one outline may be."""
 
 from __future__ import annotations
 
@@ -24,6 +25,7 @@ from refield.estimate.outline import FEWEST_POINTS, restricted
 from refield.estimate.past import Past, gone_score, silhouette
 from refield.estimate.pose_change import COARSEST, FINER, PoseChange, refine, shared_out
 from refield.estimate.register import Candidate, Target, register
+from refield.estimate.split import halves
 from refield.scene.planes import Plane
 from refield.scene.pose import transform
 from refield.vision import pixels
@@ -50,24 +52,28 @@ def fit_of(
     old: Old,
     olds: Sequence[Old],
     past: Sequence[Past],
-    parts: Sequence[Voxels],
+    arrived: tuple[Sequence[Voxels], Sequence[Voxels]],
     extra: Sequence[Tensor],
 ) -> Fit | None:
-    """The better fit of the outlines that an object may have.
+    """The better fit of the outlines that an object may have, or of a part of one that may hold several things.
 
-    ``parts``: the arrivals' components, any of which it may be, or be in.
+    ``arrived``: the arrivals' components, and those that would be told as newcomers if nothing explained them: only
+    these are worth an outline cut in two.
     """
+    (parts, newcomers_left), outlines = arrived, [old] if old.instead is None else [old, old.instead]
     fits: list[Fit] = []
-    for one in (old,) if old.instead is None else (old, old.instead):
+    for one in outlines:
         fit = best_fit(ground, one, olds, past, parts, extra)
         fits += [fit] if fit is not None else []
         if fit is not None and fit.change.explained >= ground.believe.shown:
             return fit
     whole = max(fits, key=lambda f: f.change.explained, default=None)
-    if whole is None or old.remembered:
+    if old.remembered:
         return whole
-    along = _along(ground, whole, olds, past)
-    return whole if along is None else max(whole, along, key=lambda f: f.change.net)
+    found = [] if whole is None else [whole, _along(ground, whole, olds, past)]
+    if newcomers_left and not any(fit is not None and fit.change.explained >= ground.believe.shown for fit in found):
+        found.append(_part_of(ground, outlines[-1], olds, past, newcomers_left, extra))
+    return max((fit for fit in found if fit is not None), key=lambda f: f.change.net, default=None)
 
 
 def _along(ground: Ground, fit: Fit, olds: Sequence[Old], past: Sequence[Past]) -> Fit | None:
@@ -103,6 +109,35 @@ def at_one_place(one: PoseChange, other: PoseChange, old: Old) -> bool:
     points = torch.from_numpy(old.cloud.points).double()
     apart = (transform(one.new_from_old, points) - transform(other.new_from_old, points)).norm(dim=-1)
     return bool(apart.max() < 2 * one.pixel)
+
+
+def _part_of(
+    ground: Ground,
+    old: Old,
+    olds: Sequence[Old],
+    past: Sequence[Past],
+    parts: Sequence[Voxels],
+    extra: Sequence[Tensor],
+) -> Fit | None:
+    """The better fit of the two things that an outline may be; of the whole, if the other moved along.
+
+    Any outline can be cut, and a piece fits more easily than a thing: one is believed if it or the whole left for
+    certain, and the photos show nearly all of it where it is.
+    """
+    pairs = halves(old, ground.shape)
+    if left_by(ground, past, old) is None:
+        pairs = [(half, other) for half, other in pairs if left_by(ground, past, half) is not None]
+    fits = [(best_fit(ground, half, olds, past, parts, extra), other) for half, other in pairs]
+    found = [(fit, other) for fit, other in fits if fit is not None and fit.change.explained >= ground.believe.shown]
+    if not found:
+        return None
+    best, other = max(found, key=lambda f: f[0].change.net)
+    pose = [best.change.new_from_old]
+    if _refined(ground, other, olds, past, pose, best.score, ground.believe.gains) is not None:
+        whole = _refined(ground, old, olds, past, pose, best.score, ground.believe.gains)
+        if whole is not None:
+            return whole
+    return replace(best, rest=other)
 
 
 def left_by(ground: Ground, past: Sequence[Past], old: Old) -> float | None:
