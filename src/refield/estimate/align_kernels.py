@@ -303,8 +303,8 @@ def _score(
                 e += (seen[m, 4 + k] - gain * colours[n, k]) ** 2
             # a side may be lit differently, but the less the better
             error += cosine * min(1.0, e / cap**2 + 0.25 * math.log(gain) ** 2)
-        for i in range(boxes[v, 0], boxes[v, 1]):
-            for j in range(boxes[v, 2], boxes[v, 3]):
+        for i in range(boxes[v, 1], boxes[v, 3]):
+            for j in range(boxes[v, 0], boxes[v, 2]):
                 t = targets[v, i, j]
                 if t > 0:
                     wanted += t
@@ -313,20 +313,6 @@ def _score(
     if total < 5:
         return 2.0
     return error / total + 0.7 * uncovered / max(wanted, 1.0)
-
-
-@njit(cache=True)
-def _wanted_boxes(targets: _F32) -> _I64:
-    """Rows and columns (V, 4), ends exclusive, that hold all pixels which should be covered."""
-    out = np.zeros((targets.shape[0], 4), np.int64)
-    for v in range(targets.shape[0]):
-        out[v, 0], out[v, 2] = targets.shape[1], targets.shape[2]
-        for i in range(targets.shape[1]):
-            for j in range(targets.shape[2]):
-                if targets[v, i, j] > 0:
-                    out[v, 0], out[v, 1] = min(out[v, 0], i), max(out[v, 1], i + 1)
-                    out[v, 2], out[v, 3] = min(out[v, 2], j), max(out[v, 3], j + 1)
-    return out
 
 
 @njit(cache=True, parallel=True, fastmath=True)
@@ -338,6 +324,7 @@ def register_all(
     images: _F32,
     depths: _F32,
     targets: _F32,
+    boxes: _I64,
     rotations: _F64,
     centres: _F64,
     steps: int,
@@ -349,10 +336,10 @@ def register_all(
     """Improve K poses by ``steps`` steps each and score them: rotations (K, 3, 3), centres (K, 3) in place -> (K,).
 
     points (N, 6): position and normal; sides (N,) the side of the object each is on; colours (N, 3); images
-    (V, H, W, 9): colour and its derivatives; depths, targets (V, H, W).
+    (V, H, W, 9): colour and its derivatives; depths, targets (V, H, W); boxes (V, 4): x0, y0, x1, y1 of a box around
+    all pixels of a target that should be covered.
     """
     out, n, v = np.zeros(rotations.shape[0]), points.shape[0], lenses.shape[0]
-    boxes = _wanted_boxes(targets)
     for k in prange(rotations.shape[0]):
         r, c = rotations[k], centres[k]
         placed, of, row_of = np.empty((n, 9)), np.empty((n * v, 2), np.int64), np.empty((n, v), np.int64)

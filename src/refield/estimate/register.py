@@ -218,6 +218,7 @@ class _Search:
         wanted = np.zeros(ready.depths.shape, np.float32)
         for k, w in enumerate(self.target.wanted):
             wanted[k, : w.shape[0], : w.shape[1]] = w
+        boxes = np.array([pixels.bounding_box(w > 0) or (0, 0, 0, 0) for w in self.target.wanted], np.int64)
         pick = np.random.default_rng(0).permutation(len(self.cloud.points))[:count]
         points = np.concatenate([self.cloud.points[pick] - self.middle, self.cloud.normals[pick]], -1)
         # how many pixels apart the points of the visible half lie, for counting covered pixels
@@ -230,6 +231,7 @@ class _Search:
             ready.images,
             ready.depths,
             wanted,
+            boxes,
             rotations,
             centres,
             steps,

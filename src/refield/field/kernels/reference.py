@@ -275,29 +275,6 @@ def march(
     return torch.cat(starts)[order], torch.cat(ends)[order], offsets
 
 
-def march_visible(
-    rays: Rays3,
-    space: Space,
-    grid: Tensor,
-    lattice: Lattice,
-    net: DensityNet,
-    stop: float,
-    fine: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """As :func:`march`, but a ray ends after the sample in which its optical depth passes ``stop``.
-
-    The density is that of a hash encoding and one hidden layer of relu, per world unit: exp(raw) / radius.
-    """
-    origins, directions, _ = rays
-    t0, t1, offsets = march(rays, space, grid, lattice, fine)
-    ids = _ray_ids(offsets)
-    x = origins[ids] + directions[ids] * ((t0 + t1) / 2)[:, None]
-    sigma = torch.exp(hash_density((contract(x, *space) + 2) / 4, net).clamp(max=15)) / space[1]
-    keep = _exclusive_sum(sigma * (t1 - t0), offsets) < stop
-    counts = torch.zeros(len(offsets) - 1, dtype=torch.long, device=ids.device).index_add(0, ids, keep.long())
-    return t0[keep], t1[keep], offsets_of(counts)
-
-
 class Within(NamedTuple):
     """Masks of objects: trilinear values at nodes, of which more than a half is inside, one mask after the other."""
 
@@ -311,6 +288,28 @@ class Within(NamedTuple):
     """(K,) float32 at all nodes"""
     inside: bool
     """whether the samples are meant that are in every mask, or those in none"""
+
+
+EVERYWHERE = Within(
+    torch.zeros(0, 2, 3), torch.zeros(0, 3, dtype=torch.long), torch.zeros(0, dtype=torch.long), torch.zeros(0), False
+)
+
+
+def march_visible(
+    rays: Rays3,
+    space: Space,
+    grid: Tensor,
+    lattice: Lattice,
+    net: DensityNet,
+    stop: float,
+    fine: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As :func:`march`, but a ray ends after the sample in which its optical depth passes ``stop``.
+
+    The density is that of a hash encoding and one hidden layer of relu, per world unit: exp(raw) / radius.
+    """
+    t0, t1, _, offsets = march_within(rays, space, grid, lattice, net, stop, fine, EVERYWHERE)
+    return t0, t1, offsets
 
 
 def march_within(

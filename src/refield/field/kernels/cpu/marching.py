@@ -20,18 +20,11 @@ from refield.field.kernels.cpu.networks import padded
 from refield.field.kernels.cpu.simd import JIT, exp, product
 from refield.field.kernels.cpu.walk import next_sample, start
 from refield.field.kernels.onward import Way
-from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space, Within
+from refield.field.kernels.reference import EVERYWHERE, DensityNet, Lattice, Rays3, Space, Within
 from refield.scene.inside import above
 
 _ZERO = np.float32(0)
 _BLOCK = 128  # samples whose hidden layer is held at once
-_ALL = (
-    np.zeros((0, 2, 3), np.float32),
-    np.zeros((0, 3), np.int64),
-    np.zeros(0, np.int64),
-    np.zeros(0, np.float32),
-    False,
-)
 _NO_WAY = (*(np.zeros(0, np.float32) for _ in range(3)), np.zeros((0, 0, 0), np.uint8))
 _ROOM = 32  # samples a ray that are made room for at first
 
@@ -161,7 +154,7 @@ def _wave_part(begin, end, rays, space, grids, lattice, net, way, within, arena)
     """March rays ``begin : end``; the samples, wave by wave, into ``arena``. Returns how many, or -1 without room.
 
     ``way`` is what `onward.Way` says, or empty arrays; where rays came to is written over its ``t`` and ``depth``.
-    ``within``: what `reference.Within` says, or empty arrays.
+    ``within``: what `reference.Within` says.
     """
     tables, resolutions, w_in, w_out, stop = net
     t0, t1, owner, unit, features = arena
@@ -237,16 +230,21 @@ def _sort(arena, found, cursor, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def _densities_part(unit, net, out):  # type: ignore[no-untyped-def]
-    tables, resolutions, w_in, w_out = net
-    n = len(out)
-    features = np.empty((n, w_in.shape[0]), np.float32)
-    encode_part(unit, 0, n, tables, resolutions, features.view(np.float64))
+def _raw_densities(features, begin, end, net, out):  # type: ignore[no-untyped-def]
+    """The density network's first output for features[begin:end], into out[begin:end]."""
+    _, _, w_in, w_out = net
     x, hidden = np.zeros((_BLOCK, w_in.shape[0]), np.float32), np.empty((_BLOCK, w_in.shape[1]), np.float32)
-    for first in range(0, n, _BLOCK):
-        some = min(_BLOCK, n - first)
-        sizes = (w_in.shape[0], len(w_out))
+    sizes = (w_in.shape[0], len(w_out))
+    for first in range(begin, end, _BLOCK):
+        some = min(_BLOCK, end - first)
         _raw_density(features, first, some, sizes, w_in, w_out, x, hidden, out[first : first + some])
+
+
+@njit(**JIT)
+def _densities_part(unit, net, out):  # type: ignore[no-untyped-def]
+    features = np.empty((len(out), net[2].shape[0]), np.float32)
+    encode_part(unit, 0, len(out), net[0], net[1], features.view(np.float64))
+    _raw_densities(features, 0, len(out), net, out)
 
 
 @njit(parallel=True, **JIT)
@@ -307,7 +305,7 @@ def marched(
     stop: float,
     fine: Tensor | None = None,
     way: Way | None = None,
-    within: Within | None = None,
+    within: Within = EVERYWHERE,
 ) -> Marched:
     """The waves, packed. Where rays came to is written over the ``t`` and ``depth`` of a ``way``."""
     arrays, place = _arrays(rays, space)
@@ -318,7 +316,7 @@ def marched(
     room = _ROOM * (n // parts + 1)
     found = np.zeros(parts, np.int64)
     grids = grids_of(grid, fine)
-    meant = _ALL if within is None else (*(array(a) for a in within[:4]), within.inside)
+    meant = (*(array(a) for a in within[:4]), within.inside)
     while True:
         arena = _room("waves", parts, room, width)
         on = _NO_WAY if way is None else (*(array(a).copy() for a in way[:3]), array(way.gone))
@@ -355,17 +353,12 @@ def march_visible(
 @njit(parallel=True, **JIT)
 def _densities_at(features, net, radius, out, parts):  # type: ignore[no-untyped-def]
     """The densities of features (S, F), per world unit, into out (S,)."""
-    _, _, w_in, w_out = net
     n = len(out)
     for p in prange(parts):
-        x, hidden = np.zeros((_BLOCK, w_in.shape[0]), np.float32), np.empty((_BLOCK, w_in.shape[1]), np.float32)
-        end = n * (p + 1) // parts
-        for first in range(n * p // parts, end, _BLOCK):
-            some = min(_BLOCK, end - first)
-            raw = out[first : first + some]
-            _raw_density(features, first, some, (features.shape[1], len(w_out)), w_in, w_out, x, hidden, raw)
-            for a in range(some):
-                raw[a] = exp(min(raw[a], np.float32(15))) / radius
+        begin, end = n * p // parts, n * (p + 1) // parts
+        _raw_densities(features, begin, end, net, out)
+        for s in range(begin, end):
+            out[s] = exp(min(out[s], np.float32(15))) / radius
 
 
 def march_within(
