@@ -32,7 +32,7 @@ def test_photos_of_different_states_are_not_understood():
     assert change.unexplained and "one and the same state" in change.why
 
 
-def test_one_photo_that_differs_alone_is_named_and_tells_of_no_change():
+def test_one_photo_of_several_that_differs_alone_is_named_and_tells_of_no_change():
     change = told(0.0, 0.0, 0.002, 0.034)
     assert not change.unexplained
     assert "3 % of 3.jpg differ, which nothing confirms" in change.why

@@ -75,12 +75,10 @@ def concluded(scene: Told, settled: Settled) -> SceneChange:
 
 def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...], errors: Errors) -> SceneChange:
     """The answer where the photos' changes meet nowhere in space; told if they are more than the odd spot, and more
-    than the field's ``errors`` are in photos that show no change, also without the photo that differs most: of several
-    photos, one from where the field was seen badly says nothing of the state that they show."""
+    than the field's ``errors`` are in photos that show no change."""
     why = "the pixels that differ agree on no place that more than one photo shows"
     shares = [float(c.mask.mean()) for c in changed]
-    others = sorted(shares)[:-1] or shares
-    if max(shares) < _LARGE or not errors.unusual(others):
+    if max(shares) < _LARGE or not errors.unusual(shares):
         if max(shares) >= _LARGE:
             most = changed[shares.index(max(shares))].view.frame.name
             why += f"; {100 * max(shares):.0f} % of {most} differ, which nothing confirms"

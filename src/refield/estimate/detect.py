@@ -87,10 +87,12 @@ class Errors:
     def unusual(self, shares: Sequence[float]) -> bool:
         """Whether new photos' changed parts are more than the field's errors make of as many photos without a change.
 
-        Where such parts are exponentially distributed, the quotient of two means is as F.
+        Of several photos the one that differs most is left out: it may be taken from where the field was seen badly,
+        as none of the old ones was. Where such parts are exponentially distributed, the quotient of two means is as F.
         """
         if not self.by_chance:
             return True
+        shares = sorted(shares)[:-1] or shares
         mean = (sum(self.by_chance) + DetectConfig.smallest) / len(self.by_chance)
         bound = float(fdtri(2 * len(shares), 2 * len(self.by_chance), _TRUE))
         return float(np.mean(shares)) > bound * mean
