@@ -78,11 +78,12 @@ def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...], err
     than the field's ``errors`` are in photos that show no change."""
     why = "the pixels that differ agree on no place that more than one photo shows"
     shares = [float(c.mask.mean()) for c in changed]
-    if max(shares) < _LARGE or not errors.unusual(shares):
-        if max(shares) >= _LARGE:
-            most = changed[shares.index(max(shares))].view.frame.name
-            why += f"; {100 * max(shares):.0f} % of {most} differ, which nothing confirms"
+    most = int(np.argmax(shares))
+    if shares[most] < _LARGE:
         return SceneChange((), photos, why)
+    if not errors.unusual(shares):
+        alone = f"{100 * shares[most]:.0f} % of {changed[most].view.frame.name} differ, which nothing confirms"
+        return SceneChange((), photos, f"{why}; {alone}")
     share = 100 * float(np.mean(shares))
     why += f"; {share:.0f} % of the photos' pixels are not understood: do the photos show one and the same state?"
     return SceneChange((), photos, why, unexplained=tuple(full_size(c.mask, c.view.frame) for c in changed))
