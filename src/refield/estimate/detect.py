@@ -87,15 +87,16 @@ class Errors:
     def unusual(self, shares: Sequence[float]) -> bool:
         """Whether new photos' changed parts are more than the field's errors make of as many photos without a change.
 
-        Of several photos the one that differs most is left out: it may be taken from where the field was seen badly,
-        as none of the old ones was. Where such parts are exponentially distributed, the quotient of two means is as F.
+        Of several photos the one that differs most counts as the next one does: it may be taken from where the field
+        was seen badly, as none of the old ones was. Where such parts are exponentially distributed, the sum of those
+        less than that is distributed as one of one part less, and the quotient of two means as F.
         """
         if not self.by_chance:
             return True
-        shares = sorted(shares)[:-1] or shares
-        mean = (sum(self.by_chance) + DetectConfig.smallest) / len(self.by_chance)
-        bound = float(fdtri(2 * len(shares), 2 * len(self.by_chance), _TRUE))
-        return float(np.mean(shares)) > bound * mean
+        count, old = max(len(shares) - 1, 1), len(self.by_chance)
+        mean = sum(np.minimum(shares, sorted(shares)[count - 1])) / count
+        bound = float(fdtri(2 * count, 2 * old, _TRUE))
+        return bool(mean > bound * (sum(self.by_chance) + DetectConfig.smallest) / old)
 
 
 def blur_sigma(view: View, config: DetectConfig) -> float:
