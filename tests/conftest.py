@@ -4,7 +4,9 @@ import os
 import sys
 from pathlib import Path
 
+import numba
 import pytest
+import torch
 
 from refield.cli import main
 from tests.browser import CHROMIUM
@@ -17,6 +19,11 @@ TINY_FIT += ["--fit.field.log2-table", "8", "--fit.field.width", "8"]
 
 HERE = {**os.environ, "PYTHONPATH": os.pathsep.join(str(Path(p).resolve()) for p in sys.path)}
 """The environment of a process that imports what this one imports."""
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # there is one for each core: their threads would wait for each other
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    HERE |= {name: "1" for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
 
 
 @pytest.fixture(scope="session")

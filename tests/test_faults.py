@@ -257,8 +257,8 @@ def test_numbers_do_not_depend_on_the_locale(place, locale):
 def test_photos_of_another_scene(place, monkeypatch, capsys):
     """Coloured blocks instead of the scene: refused, nothing published."""
     monkeypatch.chdir(place)
-    enough = ["--fit.steps", "200", "--fit.samples", "4096", "--fit.field.log2-table", "12", "--fit.field.width", "16"]
-    assert main(["train", "data", "trained", *TINY_FIT, *enough]) == 0
+    enough = ["--fit.steps", "400", "--fit.samples", "4096", "--fit.field.log2-table", "12", "--fit.field.width", "16"]
+    assert main(["train", "data", "trained", *TINY_FIT, *enough, "--fit.field.levels", "6"]) == 0
     write_capture(place / "other", 4, turn=0.2)
     for i, path in enumerate(sorted((place / "other/images").iterdir())):
         blocks = torch.rand(3, 4, 3, generator=torch.Generator().manual_seed(i))

@@ -275,7 +275,7 @@ def test_train_step_is_the_same_bit_for_bit_for_any_number_of_threads() -> None:
 
     before, results = numba.get_num_threads(), []
     try:
-        for threads in {1, before}:
+        for threads in {1, numba.config.NUMBA_NUM_THREADS}:
             numba.set_num_threads(threads)
             torch.manual_seed(9)
             nets, tables = networks(4, 32, 15), torch.randn(4, 1 << 12, 2)
