@@ -16,7 +16,7 @@ from refield.field.radiance import Field, HashField
 from refield.field.render import render_camera, render_many
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
-from refield.scene.change import PlacedPhoto, SceneChange
+from refield.scene.change import ObjectChange, PlacedPhoto, SceneChange
 from refield.scene.images import write_image
 from refield.update import fit_textured, relight, supervision, train
 from refield.update.config import UpdateConfig
@@ -30,7 +30,7 @@ from refield.update.spared import ShowConfig
 from refield.update.supervision import Lessons, SuperviseConfig, changed_pixels, places_of
 from refield.update.train import UpdateProgress, update_field
 from refield.vision.pixels import dilate
-from tests.update.worlds import Ball, BallWorld, at, looking_from, moved
+from tests.update.worlds import Ball, BallWorld, at, grid_of, looking_from, moved
 
 SIZE = 48
 CAMERA = Camera(SIZE, SIZE, 62.0, 62.0, SIZE / 2, SIZE / 2)
@@ -110,6 +110,22 @@ def test_the_hidden_floor_is_learnt_and_the_rest_kept(case: tuple[Capture, Scene
     assert stages[0] == "move" and "train" in stages
     assert looks and all(look.psnr > 10 for look in looks)
     assert updated.why_stopped
+
+
+def test_what_arrived_is_shown_among_all_that_was_looked_through(tmp_path: Path) -> None:
+    """A ball that floats where every old photo saw the floor behind it."""
+    ball = Ball(at(0.3, 0.2, 0.6), 0.3)
+    before, after = BallWorld(()), BallWorld((ball,))
+    old = photos(before, tmp_path / "before", [0.5 * i for i in range(12)])
+    new = photos(after, tmp_path / "after", [0.3 + math.tau / 6 * i for i in range(6)])
+    placed = tuple(PlacedPhoto(f.name, "used", frame=f) for f in new)
+    change = SceneChange((ObjectChange("added", grid_of(Ball(ball.world_from_ball, 1.15 * 0.3))),), placed)
+    updated = update_field(Capture(old), before, change, steps(200))
+    rays = camera_rays(CAMERA, looking_from(1.1, 3.0, 1.8))
+    was, now, shown = (render_many(f, rays).rgb for f in (before, after, updated))
+    here = (was - now).abs().sum(-1) > 0.05
+    assert (shown - now)[here].square().mean() < 0.25 * (was - now)[here].square().mean()
+    assert (shown - now)[~here].square().mean() < 2e-3
 
 
 def test_light_is_learnt_up_to_the_objects_edges(

@@ -52,8 +52,9 @@ class HelperConfig:
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii of the old field from the camera"""  # §10.1
     emptiness: float = 5e-2
-    """weight of the colour that comes from where nothing can be: deep inside what left, where nothing was before and,
-    half as much, beneath the ground that it stood on and above that in its rim and right beside it"""
+    """weight of the colour that comes from where hardly anything can be: inside what left the less the nearer to its
+    surface, beneath the ground that it stood on and above that in its rim and right beside it. Where nothing can be,
+    deep inside and where old photos looked through, the helper is not asked at all; with 0 it is, everywhere"""
     check_every: int = 25
     """steps between looks at the held-out pixels"""
     patience: int = 3
@@ -103,8 +104,9 @@ class HelperTraining:
         self.taught, self.new, self.judge = taught, new, judge
         added = tuple(o.grid for o in frozen.change.objects if o.kind == "added")
         taken = Region(added + frozen.bare.grids)
-        self.misplaced = config.emptiness * emptiness(frozen.change, helper.sampler, taken, ground, sight)
-        self.occupancy = HelperOccupancy(helper, draw)
+        empty = emptiness(frozen.change, helper.sampler, taken, ground, sight)
+        self.misplaced = config.emptiness * empty
+        self.occupancy = HelperOccupancy(helper, draw, (empty == 1) & (config.emptiness > 0))
         self.adam = TableAdam(helper)
         self.rays_per_step, self.steps_done = _RAYS[0], 0
         self.why_stopped = "all steps done"

@@ -122,10 +122,17 @@ def _band(foothold: Foothold, cell: float) -> float:
 
 
 class HelperOccupancy(OccupancyTrainer):
-    """The helper's occupancy grid in training: the engine's, never outside the region."""
+    """The helper's occupancy grid in training: the engine's, never outside the region, nor where nothing can be.
 
-    def __init__(self, helper: HashField, draw: torch.Generator) -> None:
-        super().__init__(helper, _CULL_FROM, helper.sampler.grid.reshape(-1) > 0, doubt=0.0, draw=draw)
+    A price on what is shown there would not do: where that is most of the region, it empties the helper before a small
+    thing begins to show.
+    """
+
+    def __init__(self, helper: HashField, draw: torch.Generator, nothing: Tensor) -> None:
+        """``nothing``: (R**3,) bool, in which cells nothing can be."""
+        allowed = (helper.sampler.grid.reshape(-1) > 0) & ~nothing
+        helper.looking_where(allowed.to(torch.uint8).reshape(helper.sampler.grid.shape))
+        super().__init__(helper, _CULL_FROM, allowed, doubt=0.0, draw=draw)
 
     def finish(self) -> None:
         """The grid to show: opaque cells next to what training rays saw. Few photos see little of a surface; a view
