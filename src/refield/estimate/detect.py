@@ -88,8 +88,8 @@ class Errors:
         """Whether new photos' changed parts are more than the field's errors make of as many photos without a change.
 
         Of several photos the one that differs most counts as the next one does: it may be taken from where the field
-        was seen badly, as none of the old ones was. Where such parts are exponentially distributed, the sum of those
-        less than that is distributed as one of one part less, and the quotient of two means as F.
+        was seen badly, as none of the old ones was. If such parts are exponentially distributed, the sum of n counted
+        like that is distributed as that of n - 1, and the quotient of two means as F.
         """
         if not self.by_chance:
             return True
