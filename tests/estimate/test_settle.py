@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from refield.estimate import recipe, settle
-from refield.estimate.lattice import grown
+from refield.estimate.lattice import Body, grown
 from refield.estimate.likelihood import Settled, judged, pixels_of
 from refield.scene.pose import angle_between, transform
 from tests.estimate.boxes import BoxWorld, capture_of, new_photos, standing, turn
@@ -54,7 +54,7 @@ def test_the_truth_leaves_less_unexplained_than_any_other_hypothesis(capture, tm
         back = transform(torch.linalg.inv(AWAY), torch.from_numpy(lattice.centres).double()).numpy()
         there = old.lattice.holds(grown(old.voxels, 1), back.astype(np.float32))
         views = tuple(settle.without(ground, changed, [old]))
-        return replace(found, moved={}, removed={k: 1.0}, arrived=(there,), views=views)
+        return replace(found, moved={}, removed={k: 1.0}, arrived=(Body(lattice, there),), views=views)
 
     def left_by(hypothesis: Settled) -> float:
         return judged(ground, hypothesis)[1]
@@ -87,7 +87,7 @@ def test_a_newcomer_that_explains_nothing_is_taken_back(capture, tmp_path, monke
     low, high = lattice.centres.reshape(-1, 3).min(0), lattice.centres.reshape(-1, 3).max(0)
     corner = (lattice.centres < low + 0.15 * (high - low)).all(-1)
     bare = replace(found, moved={}, removed={})
-    kept, left = judged(ground, replace(bare, arrived=(corner,)))
+    kept, left = judged(ground, replace(bare, arrived=(Body(lattice, corner),)))
     assert kept.arrived == () and left == judged(ground, bare)[1]
 
 

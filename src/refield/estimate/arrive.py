@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,70 +12,117 @@ from torch import Tensor
 
 from refield.estimate.detect import Mask
 from refield.estimate.ground import Ground
-from refield.estimate.hull import votes
-from refield.estimate.lattice import Lattice, Voxels, components, grown
+from refield.estimate.hull import HullConfig, look_behind, votes
+from refield.estimate.lattice import Body, Lattice, Voxels, components, grown
 from refield.estimate.light import Ratio
 from refield.estimate.look import Array, View
 from refield.estimate.objects import Old
+from refield.estimate.outline import free_voxels
 from refield.estimate.past import Past
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
+_EVERY_WAY = np.ones((3, 3, 3), bool)
+
 
 def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> Voxels:
-    """Voxels that newcomers may fill: in every seeing view's unexplained change, and empty once the old are gone."""
-    hull, config = ground.hull, ground.carving
-    points = hull.lattice.centres.reshape(-1, 3)
-    seen = [(p.changed.witness(p.depth), p.changed.mask & ~p.explained) for p in past]
-    inside, against = votes(points, [(v, pixels.dilate(m, config.margin)) for v, m in seen], config)
-    sure, _ = votes(points, [(v, pixels.dilate(p.open, 1)) for (v, _), p in zip(seen, past)], config)
-    air = ~hull.solid.reshape(-1)
-    for old in olds:
-        air |= old.lattice.holds(grown(old.voxels, 1), points)
-    needed = min(2, len(past))
-    found = (inside >= needed) & (sure >= needed) & (against == 0) & air
-    return found.reshape(hull.lattice.shape) & ground.free
+    """Voxels of the hull that newcomers may fill: in every seeing view's unexplained change, and empty once the old are
+    gone."""
+    hull = ground.hull
+    return _fillable(hull.lattice, ~hull.solid, past, olds, ground.carving) & ground.free
 
 
-def newcomers(ground: Ground, voxels: Voxels, past: Sequence[Past]) -> list[Voxels]:
-    """Components of the arrivals that explain changed pixels which nothing else does."""
-    lattice = ground.hull.lattice
-    core = ndimage.binary_erosion(voxels, np.ones((3, 3, 3), bool))  # not the thin sheets left between masks
-    thick = grown(core, 2, voxels) if core.any() else core
-    out: list[Voxels] = []
-    taken = [~p.open for p in past]
-    for part in components(thick, ground.carving.smallest):
-        shares = []
-        shadows = [shadow_of(p.view, lattice, part) for p in past]
-        for here, gone, p in zip(shadows, taken, past):
-            if (here & ~gone).sum() >= ground.detect.smallest * here.size * 2:
-                shares.append(float((here & ~gone).sum() / (here & p.known).sum()))
+def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list[Body]:
+    """Bodies that explain changed pixels which nothing else does, those that explain most of them first.
+
+    Each is carved on a lattice of its own: on the hull's, which holds everything, a small thing has few voxels.
+    """
+    some = [Body(ground.hull.lattice, part) for part in components(arrivals(ground, past, olds), 1)]
+    some = [body for body in some if any(_speaks(ground, s & p.open) for s, p in zip(_shadows(past, body), past))]
+    left = [(b, _shadows(past, b)) for body in some for b in _thick(ground, _finer(ground, body, past, olds))]
+    out: list[Body] = []
+    open_ = [p.open for p in past]
+    while left:
+        left.sort(key=lambda one: -sum(int((here & o).sum()) for here, o in zip(one[1], open_)))
+        body, shadows = left.pop(0)
+        seen = [(here, o, p.known) for here, o, p in zip(shadows, open_, past) if _speaks(ground, here & o)]
+        shares = [float((here & o).sum() / (here & known).sum()) for here, o, known in seen]
         enough = len(shares) >= min(2, len(past)) and float(np.median(shares)) > ground.believe.arrived
-        if enough and not _only_light(ground, part, past):
-            out.append(part)
-            taken = [t | pixels.dilate(s, 1) for t, s in zip(taken, shadows)]
+        if enough and not _only_light(ground, body, past):
+            out.append(body)
+            open_ = [o & ~pixels.dilate(here, 1) for o, here in zip(open_, shadows)]
     return out
 
 
+def exactly(ground: Ground, body: Body, past: Sequence[Past], olds: Sequence[Old]) -> Body:
+    """A newcomer without what lies beside the photos' masks, by which it was carved with a margin."""
+    config = replace(ground.carving, margin=0)
+    inside = body.voxels & _fillable(body.lattice, _air(ground, body.lattice, past), past, olds, config)
+    return replace(body, voxels=inside) if inside.any() else body
+
+
+def _finer(ground: Ground, coarse: Body, past: Sequence[Past], olds: Sequence[Old]) -> Body:
+    """What a component of the arrivals is on a lattice of its own, whose voxels are no smaller than pixels."""
+    config, at, reach = ground.carving, coarse.places, coarse.lattice.cell
+    pixel = min(float(np.linalg.norm(at - p.view.centre, axis=1).min()) * p.view.pixel_angle for p in past)
+    lattice = Lattice.over(at.min(0) - reach, at.max(0) + reach, config.longest, pixel)
+    voxels = free_voxels(lattice, ground.planes) & coarse.lattice.holds(grown(coarse.voxels, 1), lattice.centres)
+    return Body(lattice, voxels & _fillable(lattice, _air(ground, lattice, past), past, olds, config))
+
+
+def _air(ground: Ground, lattice: Lattice, past: Sequence[Past]) -> Voxels:
+    """Voxels that some old rendering looks through."""
+    views = [*ground.survey, *(p.view for p in past)]
+    return look_behind(lattice.centres.reshape(-1, 3), views, ground.carving)[0].reshape(lattice.shape)
+
+
+def _fillable(lattice: Lattice, air: Voxels, past: Sequence[Past], olds: Sequence[Old], config: HullConfig) -> Voxels:
+    """Voxels in every seeing view's unexplained change that are ``air``, or the place of one of the old."""
+    points, margin = lattice.centres, config.margin
+    flat = points.reshape(-1, 3)
+    seen = [(p.changed.witness(p.depth), p.changed.mask & ~p.explained) for p in past]
+    inside, against = votes(flat, [(v, pixels.dilate(m, margin)) for v, m in seen], config)
+    sure, _ = votes(flat, [(v, pixels.dilate(p.open, margin)) for (v, _), p in zip(seen, past)], config)
+    for old in olds:
+        air = air | old.lattice.holds(grown(old.voxels, 1), points)
+    needed = min(2, len(past))
+    return ((inside >= needed) & (sure >= needed) & (against == 0)).reshape(lattice.shape) & air
+
+
+def _thick(ground: Ground, body: Body) -> list[Body]:
+    """The parts of a body, without the thin sheets that are left between masks."""
+    core = ndimage.binary_erosion(body.voxels, _EVERY_WAY)
+    thick = grown(core, 2, body.voxels) if core.any() else core
+    return [replace(body, voxels=part) for part in components(thick, ground.carving.smallest)]
+
+
+def _shadows(past: Sequence[Past], body: Body) -> list[Mask]:
+    return [shadow_of(p.view, body) for p in past]
+
+
+def _speaks(ground: Ground, mask: Mask) -> bool:
+    """Whether so many pixels of a photo say anything."""
+    return float(mask.mean()) >= 2 * ground.detect.smallest
+
+
 def remarkable(
-    ground: Ground, parts: Sequence[Voxels], past: Sequence[Past], places: Sequence[tuple[Old, Tensor]]
-) -> list[Voxels]:
+    ground: Ground, parts: Sequence[Body], past: Sequence[Past], places: Sequence[tuple[Old, Tensor]]
+) -> list[Body]:
     """Would-be newcomers that are no scraps at the edges of objects."""
     large = [p for p in parts if _substantial(ground, p, past)]
-    return [p for p in large if not any(_rim_of(ground, p, old, place) for old, place in places)]
+    return [p for p in large if not any(_rim_of(p, old, place) for old, place in places)]
 
 
-def _substantial(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
+def _substantial(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
     """Whether a would-be newcomer is large enough in some photo; what is left over at the edge of others is not."""
-    shadows = [shadow_of(p.view, ground.hull.lattice, part) & p.open for p in past]
-    return max(float(s.mean()) for s in shadows) >= ground.believe.smallest
+    shadows = _shadows(past, part)
+    return max(float((s & p.open).mean()) for s, p in zip(shadows, past)) >= ground.believe.smallest
 
 
-def _rim_of(ground: Ground, part: Voxels, old: Old, new_from_old: Tensor) -> bool:
+def _rim_of(part: Body, old: Old, new_from_old: Tensor) -> bool:
     """Whether a small would-be newcomer hugs an object's old or new place: a contact shadow, the rest of an outline."""
-    lattice = ground.hull.lattice
-    points = torch.from_numpy(lattice.centres[part])
-    if len(points) * lattice.cell**3 > 0.2 * old.volume:
+    points = torch.from_numpy(part.places)
+    if len(points) * part.lattice.cell**3 > 0.2 * old.volume:
         return False
     back = transform(invert(new_from_old), points).numpy()
     reach = max(2, round(0.35 * old.radius / old.lattice.cell))
@@ -84,34 +132,34 @@ def _rim_of(ground: Ground, part: Voxels, old: Old, new_from_old: Tensor) -> boo
     return float(near[tuple(ijk[inside].T)].sum()) > 0.5 * len(points)
 
 
-def _only_light(ground: Ground, part: Voxels, past: Sequence[Past]) -> bool:
+def _only_light(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
     """Whether a would-be newcomer lies flat on what holds things up and only darkens or brightens it."""
-    points = ground.hull.lattice.centres[part]
+    points = part.places
     extent = float((points.max(0) - points.min(0)).max())
-    low = max(5 * ground.hull.lattice.cell, 0.3 * extent)
+    low = max(5 * part.lattice.cell, 0.3 * extent)
     if not any((plane.above(points) <= low).mean() >= 0.95 for plane in ground.planes):
         return False
     alike, shown = 0, 0
     for p in past:
-        here = shadow_of(p.view, ground.hull.lattice, part) & p.open
+        here = shadow_of(p.view, part) & p.open
         alike += int((here & Ratio.of(p.view, p.rgb, ground.detect).even_and_grey).sum())
         shown += int(here.sum())
     return alike > 0.5 * shown
 
 
-def fresh(past: Sequence[Past], lattice: Lattice, part: Voxels) -> float:
+def fresh(past: Sequence[Past], body: Body) -> float:
     """Part of a newcomer's pixels that nothing else explains, the median over photos that show any."""
-    shadows = [(shadow_of(p.view, lattice, part), p.open) for p in past]
+    shadows = [(shadow_of(p.view, body), p.open) for p in past]
     shares = [float((here & left).sum() / here.sum()) for here, left in shadows if here.any()]
     return float(np.median(shares)) if shares else 0.0
 
 
-def shadow_of(view: View, lattice: Lattice, voxels: Voxels, depth: Array | None = None) -> Mask:
+def shadow_of(view: View, body: Body, depth: Array | None = None) -> Mask:
     """Pixels that voxels project to; with the ``depth`` (H, W) of what stands there, those that it does not hide."""
     out = np.zeros(view.shape, bool)
-    uv, distance, inside = view.project(lattice.centres[voxels])
+    uv, distance, inside = view.project(body.places)
     if depth is not None:
-        inside = inside & (distance < view.lookup(depth, uv, inside) + lattice.cell)
+        inside = inside & (distance < view.lookup(depth, uv, inside) + body.lattice.cell)
     ij = uv[inside].astype(np.int64)
     out[ij[:, 1], ij[:, 0]] = True
     return pixels.close(out, 5)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from refield.estimate.arrive import arrivals, newcomers, remarkable
+from refield.estimate.arrive import newcomers, remarkable
 from refield.estimate.detect import Changed
 from refield.estimate.fit import Fit, at_one_place, fit_again, fit_of, left_by
 from refield.estimate.ground import Ground
@@ -90,7 +90,7 @@ def _place(
     cut: set[int] = set()  # what is left of outlines of which a part was found
     guess = cache(lambda k: matched_poses(tried[k], first, ground.survey, ground.matcher))
     while True:
-        parts = newcomers(ground, arrivals(ground, views, everyone), views)[: ground.believe.most]
+        parts = newcomers(ground, views, everyone)[: ground.believe.most]
         left = remarkable(ground, parts, views, places_of(everyone, [(olds[k], c) for k, c in moved.items()]))
         fits: dict[int, Fit] = {}
         # what moved before moves again: a piece of something else is tried only on what that leaves unexplained

@@ -12,11 +12,11 @@ from scipy import ndimage
 from torch import Tensor
 
 from refield.estimate import past, segment
-from refield.estimate.arrive import fresh, shadow_of
+from refield.estimate.arrive import exactly, fresh, shadow_of
 from refield.estimate.confidence import confidence
 from refield.estimate.detect import Changed, Errors, Mask
-from refield.estimate.hull import Hull
-from refield.estimate.lattice import Lattice, Voxels
+from refield.estimate.ground import Ground
+from refield.estimate.lattice import Body
 from refield.estimate.layers import Sight, layers_at
 from refield.estimate.likelihood import Settled
 from refield.estimate.look import Array, full_size
@@ -38,37 +38,38 @@ _MASK_RAYS = 300_000  # for the outlines of one object in all new photos; larger
 class Told:
     """What a conclusion is drawn from, besides what was settled."""
 
-    field: Field
+    ground: Ground
     frames: Sequence[Frame]
     """the old training photos"""
     changed: Sequence[Changed]
     photos: tuple[PlacedPhoto, ...]
     """all of the new ones; ``changed`` and the settled views go with those that are used"""
-    carved: Hull
     errors: Errors
     """what the field gets wrong where nothing changed"""
 
 
 def concluded(scene: Told, settled: Settled) -> SceneChange:
     """The estimate's answer: what is believed, why, and what is not understood."""
-    olds, frames, lattice = settled.olds, scene.frames, scene.carved.lattice
+    olds, frames = settled.olds, scene.frames
+    gone = [olds[k] for k in (*settled.moved, *settled.removed)]
+    came = [exactly(scene.ground, body, settled.views, gone) for body in settled.arrived]
     changes = [_moved(frames, olds[k], change, settled.led[k]) for k, change in settled.moved.items()]
     for k, share in settled.removed.items():
         note = f"{100 * share:.0f} % of its pixels show what is behind it"
         note += "; or it moved, and shows a side that no old photo saw" if settled.arrived else ""
         masks, sure = _masks_of(frames, olds[k]), confidence("removed", settled.led[k], bool(settled.arrived))
         changes.append(ObjectChange("removed", olds[k].shape, masks=masks, confidence=sure, note=note))
-    for part, lead in zip(settled.arrived, settled.came):
-        grid, share = _newcomer(lattice, part), fresh(settled.views, lattice, part)
+    for body, lead in zip(came, settled.came):
+        grid, share = _newcomer(body), fresh(settled.views, body)
         note = f"it hides what was there in {100 * share:.0f} % of its pixels, and nothing that left looks like it"
         masks, sure = segment.masks_in(frames, grid), confidence("added", lead, bool(settled.removed))
         changes.append(ObjectChange("added", grid, masks_in=masks, confidence=sure, note=note))
-    left = _unexplained(scene, settled)
+    left = _unexplained(scene, settled, came)
     reasons = [f"1 {c.kind}{_by(c)}: {c.note}" for c in changes]
     reasons += [_said_of(scene, left)] if left else []
     if not reasons:
         reasons = ["some pixels differ, but no object that moved, left or arrived explains them better than before"]
-    ins, outs = _pixel_masks(scene.field, scene.changed, settled, lattice) if changes else ((), ())
+    ins, outs = _pixel_masks(scene.ground.field, scene.changed, settled, came) if changes else ((), ())
     unexplained = tuple(full_size(m, c.view.frame) for m, c in zip(left, scene.changed))
     return SceneChange(tuple(changes), scene.photos, "; ".join(reasons), ins, outs, unexplained)
 
@@ -122,7 +123,7 @@ def _by(o: ObjectChange) -> str:
     return f" by {float(o.shift.norm()):.4g} and turned by {o.turn_deg:.0f} degrees"
 
 
-def _unexplained(scene: Told, settled: Settled) -> list[Mask]:
+def _unexplained(scene: Told, settled: Settled, came: Sequence[Body]) -> list[Mask]:
     """Per photo, the changed pixels that nothing accounts for; nothing at all if they are few, beside the others or
     beside what the field gets wrong in photos that show no change."""
     out = []
@@ -130,8 +131,8 @@ def _unexplained(scene: Told, settled: Settled) -> list[Mask]:
         told = pixels.dilate(p.covered, 3) | p.explained | ~p.known
         for k in (*settled.moved, *settled.removed):
             told |= pixels.dilate(past.silhouette(c.view, settled.olds[k]), 3)
-        for part in settled.arrived:
-            told |= pixels.dilate(shadow_of(c.view, scene.carved.lattice, part), 3)
+        for body in came:
+            told |= pixels.dilate(shadow_of(c.view, body), 3)
         left = c.mask & ~told
         left = pixels.dilate(pixels.erode(left, 1), 1) & left
         out.append(pixels.keep_components(left, max(12, _NOTABLE * left.size)))
@@ -153,23 +154,24 @@ def _said_of(scene: Told, left: Sequence[Mask]) -> str:
     )
 
 
-def _newcomer(lattice: Lattice, part: Voxels) -> OccupancyGrid:
-    return lattice.grid(ndimage.gaussian_filter(ndimage.binary_fill_holes(part).astype(np.float32), 0.7))
+def _newcomer(body: Body) -> OccupancyGrid:
+    solid = ndimage.binary_fill_holes(body.voxels).astype(np.float32)
+    return body.lattice.grid(ndimage.gaussian_filter(solid, 0.7))
 
 
 def _pixel_masks(
-    field: Field, changed: Sequence[Changed], settled: Settled, lattice: Lattice
+    field: Field, changed: Sequence[Changed], settled: Settled, came: Sequence[Body]
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Per new photo at its full size: what shows that arrived or moved, and where something used to be."""
     ins, outs = [], []
     for c in changed:
-        came = np.zeros(c.view.shape, bool)
-        for part in settled.arrived:
-            came |= shadow_of(c.view, lattice, part)
+        new = np.zeros(c.view.shape, bool)
+        for body in came:
+            new |= shadow_of(c.view, body)
         gone = np.zeros(c.view.shape, bool)
         for k in (*settled.moved, *settled.removed):
             gone |= past.silhouette(c.view, settled.olds[k])
-        ins.append(full_size(c.mask & came, c.view.frame))
+        ins.append(full_size(c.mask & new, c.view.frame))
         outs.append(full_size(pixels.dilate(gone, 1), c.view.frame))
     olds = [settled.olds[k] for k in (*settled.moved, *settled.removed)]
     for k, change in settled.moved.items():

@@ -7,11 +7,12 @@ that excess is seen against something else by each photo, so their colours disag
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from refield.estimate.detect import Mask
-from refield.estimate.lattice import Lattice, Voxels, components
+from refield.estimate.lattice import Body, Lattice, components
 from refield.estimate.look import Array, View
 from refield.vision import pixels
 
@@ -21,16 +22,16 @@ _LONGEST = 40  # voxels along the longest side while carving
 _LEAST = 0.15  # of the voxels that must be left, else the colours say nothing
 
 
-def consistent(lattice: Lattice, voxels: Voxels, photos: Sequence[tuple[View, Mask]]) -> Voxels:
-    """The voxels left when those are taken away, from the outside in, whose colours the photos do not agree on.
+def consistent(body: Body, photos: Sequence[tuple[View, Mask]]) -> Body:
+    """What is left of a body once the voxels are taken off, from the outside in, whose colours photos do not agree on.
 
     Args:
         photos: new views, and the pixels (H, W) of each that show something new.
     """
     labs = [pixels.to_lab(pixels.blur(v.photo, 0.7)) for v, _ in photos]
-    where = lattice.centres[voxels]
-    coarse = Lattice.over(where.min(0), where.max(0), _LONGEST, lattice.cell)
-    left = lattice.holds(voxels, coarse.centres)
+    where = body.places
+    coarse = Lattice.over(where.min(0), where.max(0), _LONGEST, body.lattice.cell)
+    left = body.lattice.holds(body.voxels, coarse.centres)
     begin = int(left.sum())
     for _ in range(_ROUNDS):
         at = np.argwhere(left)
@@ -41,8 +42,8 @@ def consistent(lattice: Lattice, voxels: Voxels, photos: Sequence[tuple[View, Ma
         left[tuple(at[wrong].T)] = False
     parts = components(left, 8)
     if not parts or parts[0].sum() < _LEAST * begin:
-        return voxels
-    return voxels & coarse.holds(parts[0], lattice.centres)
+        return body
+    return replace(body, voxels=body.voxels & coarse.holds(parts[0], body.lattice.centres))
 
 
 def _shown(view: View, mask: Mask, points: Array, cell: float) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from refield.estimate.detail import Detail, detail_of
 from refield.estimate.explain import explained_before
 from refield.estimate.ground import Ground
 from refield.estimate.hull import votes
-from refield.estimate.lattice import Lattice, Voxels, components, some_of
+from refield.estimate.lattice import Body, Lattice, components, some_of
 from refield.estimate.layers import Sight
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
@@ -52,7 +52,7 @@ def fit_of(
     old: Old,
     olds: Sequence[Old],
     past: Sequence[Past],
-    arrived: tuple[Sequence[Voxels], Sequence[Voxels]],
+    arrived: tuple[Sequence[Body], Sequence[Body]],
     extra: Sequence[Tensor],
 ) -> Fit | None:
     """The better fit of the outlines that an object may have, or of a part of one that may hold several things.
@@ -116,7 +116,7 @@ def _part_of(
     old: Old,
     olds: Sequence[Old],
     past: Sequence[Past],
-    parts: Sequence[Voxels],
+    parts: Sequence[Body],
     extra: Sequence[Tensor],
 ) -> Fit | None:
     """The better fit of the two things that an outline may be; of the whole, if the other moved along.
@@ -151,7 +151,7 @@ def best_fit(
     old: Old,
     olds: Sequence[Old],
     past: Sequence[Past],
-    parts: Sequence[Voxels],
+    parts: Sequence[Body],
     extra: Sequence[Tensor] = (),
 ) -> Fit | None:
     """The pose change that best explains the photos with one old object; None if none does.
@@ -159,7 +159,7 @@ def best_fit(
     ``parts``: the arrivals' components, any of which it may be, or be in.
     """
     found: list[Candidate] = []
-    for target in (t for part in parts for t in targets_of(past, ground.hull.lattice, part, old)):
+    for target in (t for part in parts for t in targets_of(past, part, old)):
         found += register(old.cloud, past, target, ground.up, ground.search, extra)
         if min(c.score for c in found) <= ground.search.enough:
             break
@@ -294,15 +294,16 @@ def trimmed(ground: Ground, sight: Sight, change: PoseChange) -> tuple[Old, Pose
     return (old, change) if again is None or again.explained <= change.explained - 0.02 else (smaller, again)
 
 
-def targets_of(past: Sequence[Past], lattice: Lattice, voxels: Voxels, old: Old) -> list[Target]:
+def targets_of(past: Sequence[Past], body: Body, old: Old) -> list[Target]:
     """A component of the arrivals as places to register an object to; those that come later are for when it fails.
 
     Its middle, and where its bulk is thickest. One that is much larger than the object holds others too: then the
     object may be wherever it fits in, and need not explain the whole.
     """
     wanted, never = [], []
+    lattice, voxels = body.lattice, body.voxels
     for p in past:
-        here = p.open & shadow_of(p.view, lattice, voxels)
+        here = p.open & shadow_of(p.view, body)
         out = ~pixels.dilate(p.changed.mask | p.changed.light | p.covered, 3)
         wanted.append(here.astype(np.float32) - out.astype(np.float32))
         never.append(-out.astype(np.float32))

@@ -64,6 +64,19 @@ class Lattice:
         return OccupancyGrid(aabb, torch.from_numpy(np.ascontiguousarray(values, np.float32)))
 
 
+@dataclass(frozen=True)
+class Body:
+    """Voxels of a lattice of their own."""
+
+    lattice: Lattice
+    voxels: Voxels
+
+    @property
+    def places(self) -> Array:
+        """(K, 3) the voxels' centres"""
+        return self.lattice.centres[self.voxels]
+
+
 def components(voxels: Voxels, smallest: int) -> list[Voxels]:
     """Connected parts (26 neighbours) of at least ``smallest`` voxels, the largest first."""
     labels, count = ndimage.label(voxels, _EVERY_WAY)

@@ -17,7 +17,7 @@ from refield.estimate.arrive import shadow_of
 from refield.estimate.detect import difference
 from refield.estimate.explain import LIMIT, Compared, relit
 from refield.estimate.ground import Ground
-from refield.estimate.lattice import Voxels
+from refield.estimate.lattice import Body
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.past import Past, silhouette
@@ -39,7 +39,7 @@ class Settled:
     """by index of the old object"""
     removed: dict[int, float] = field(default_factory=dict)
     """by index of the old object: part of its pixels that show what was behind"""
-    arrived: tuple[Voxels, ...] = ()
+    arrived: tuple[Body, ...] = ()
     views: tuple[Past, ...] = ()
     olds: tuple[Old, ...] = ()
     """the old objects, those that were found again without what cannot be theirs"""
@@ -61,17 +61,17 @@ def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     found = [_left(ground, settled, p) for p in settled.views]
     left, tells = [e for e, _ in found], [t for _, t in found]
     arrived, came = [], []
-    for part in settled.arrived:
-        shown = [shadow_of(p.view, ground.hull.lattice, part, p.depth) for p in settled.views]
+    for body in settled.arrived:
+        shown = [shadow_of(p.view, body, p.depth) for p in settled.views]
         gain = sum(float((e[here & t] - _CAME).sum()) for here, t, e in zip(shown, tells, left))
         if gain > 0:
-            arrived.append(part)
+            arrived.append(body)
             came.append(gain / sum(int(here.sum()) for here in shown))
             left = [np.where(here, _CAME, e) for here, e in zip(shown, left)]
-    body = _BODY * ground.believe.smallest * float(np.mean([e.size for e in left] or [0]))
+    price = _BODY * ground.believe.smallest * float(np.mean([e.size for e in left] or [0]))
     bodies = 2 * len(settled.moved) + len(settled.removed)
     told = replace(settled, arrived=tuple(arrived), came=tuple(came))
-    return told, bodies * body + sum(float(e.sum()) for e in left)
+    return told, bodies * price + sum(float(e.sum()) for e in left)
 
 
 def _left(ground: Ground, settled: Settled, p: Past) -> tuple[Array, NDArray[np.bool_]]:

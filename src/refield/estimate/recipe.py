@@ -157,7 +157,7 @@ def estimate_change(
     if more:
         settled = search.settle([o for o in more if not is_piece(o, [*told, *more])], settled)
     say("segment")
-    answer = concluded(Told(field, capture.train, scene.changed, photos, carved, scene.errors), settled)
+    answer = concluded(Told(ground, capture.train, scene.changed, photos, scene.errors), settled)
     return replace(answer, why=answer.why + _never_seen(scene.changed))
 
 
@@ -171,11 +171,12 @@ def _detected(
     changed = detect.changes(views, errors, config.detect)
     shares = [float(c.mask.mean()) for c in changed]
     photos = tuple(_verdict(c.view, share, config.most_changed) for c, share in zip(changed, shares))
-    if all(p.status == "rejected" for p in photos):
+    refused = sum(p.status == "rejected" for p in photos)
+    if 2 * refused > len(photos):  # what was taken with them shows hardly another place
         what = f"{100 * float(np.mean(shares)):.0f} % of the pixels changed; is this the same scene?"
         give = "give photos of the scene that was trained, in its light, with poses in its world"
         raise InputError("new photos", what, give)
-    if any(p.status == "rejected" for p in photos):
+    if refused:
         used = [v for v, p in zip(views, photos) if p.status == "used"]
         changed = detect.changes(used, errors, config.detect)
     survey = [s.view for s in errors.shown]

@@ -45,6 +45,8 @@ class RegisterConfig:
     """of the object's apparent diameter"""
     fine_blur: float = 0.03
     """of the object's apparent diameter"""
+    places: int = 3
+    """at which all rotations are tried: where turns about the support's normal, or guesses, fit best"""
     enough: float = 0.2
     """a score that turns about the support's normal, or a guess, reach; then no other rotation is tried"""
     cap: float = 0.25
@@ -165,9 +167,10 @@ def register(
     found = search.best(likely, centres)
     if found[0].score > config.enough:
         every = super_fibonacci(config.rotations)
-        best = transform(found[0].new_from_old, torch.from_numpy(middle).double()).numpy()
-        start = places[np.linalg.norm(places - best, axis=-1).argmin()]
-        found += search.best(every, np.repeat(start[None], len(every), 0))
+        at = transform(torch.stack([c.new_from_old for c in found]), torch.from_numpy(middle).double()).numpy()
+        nearest = np.linalg.norm(places - at[:, None], axis=-1).argmin(-1)
+        for start in list(dict.fromkeys(nearest.tolist()))[: config.places]:
+            found += search.best(every, np.repeat(places[start][None], len(every), 0))
     poses = torch.stack([c.new_from_old for c in found])
     at = transform(poses, torch.from_numpy(middle).double()).numpy()
     order = search.distinct(poses[:, :3, :3].numpy(), at, np.array([c.score for c in found]), 8, 3.0)

@@ -15,7 +15,7 @@ from itertools import count
 import numpy as np
 import torch
 
-from refield.estimate.arrive import arrivals, fresh, newcomers, remarkable, shadow_of
+from refield.estimate.arrive import fresh, newcomers, remarkable, shadow_of
 from refield.estimate.associate import may_have_changed, place_all, places_of, without
 from refield.estimate.comoving import with_comoving
 from refield.estimate.consist import consistent
@@ -23,7 +23,7 @@ from refield.estimate.detect import Changed
 from refield.estimate.fit import Fit, at_one_place, believed, gains_enough, left_by, rest_of, slid
 from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
-from refield.estimate.lattice import Lattice, Voxels
+from refield.estimate.lattice import Body, Voxels
 from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_of
 from refield.estimate.look import Array
@@ -207,9 +207,9 @@ class Search:
         """
         if not best.arrived and (best.moved or best.removed):
             return []
-        came = [_box(self.ground.hull.lattice, part) for part in best.arrived]
+        came = [_box(body) for body in best.arrived]
         olds = {k: old for k, old in enumerate(best.olds) if k not in best.removed}
-        some = {k: old for k, old in olds.items() if _beside(_box(old.lattice, old.voxels), came)}
+        some = {k: old for k, old in olds.items() if _beside(_box(Body(old.lattice, old.voxels)), came)}
         asked = [(k, one) for k, old in some.items() for one in (old, old.instead) if one is not None]
         return asked + self._whole(some)
 
@@ -237,9 +237,9 @@ class Search:
         return out
 
 
-def _box(lattice: Lattice, voxels: Voxels) -> Array:
-    """The box around some voxels, (2, 3) world."""
-    at = lattice.centres[voxels]
+def _box(body: Body) -> Array:
+    """The box around a body, (2, 3) world."""
+    at = body.places
     return np.stack([at.min(0), at.max(0)])
 
 
@@ -270,20 +270,20 @@ def _completed(
         views = without(ground, changed, [olds[k] for k in kept], placed)
     gone = [olds[k] for k in kept]
     places = places_of(gone, [(olds[k], c) for k, c in moved.items()])
-    arrived = remarkable(ground, newcomers(ground, arrivals(ground, views, gone), views), views, places)
-    arrived = [consistent(ground.hull.lattice, p, [(v.view, v.open) for v in views]) for p in arrived]
+    parts = remarkable(ground, newcomers(ground, views, gone), views, places)
+    arrived = [consistent(body, [(v.view, v.open) for v in views]) for body in parts]
     # what its colours leave of it must be as believable as the whole was
-    arrived = [p for p in arrived if fresh(views, ground.hull.lattice, p) >= ground.believe.arrived]
+    arrived = [body for body in arrived if fresh(views, body) >= ground.believe.arrived]
     return Settled(moved, removed, tuple(arrived), tuple(views), tuple(olds), tuple(touched))
 
 
 def unexplained(ground: Ground, settled: Settled, part: Voxels) -> bool:
     """Whether most of the changed pixels that some voxels project to are not accounted for by what was settled."""
-    lattice = ground.hull.lattice
+    asked = Body(ground.hull.lattice, part)
     shown, left = 0, 0
     for p in settled.views:
-        here = shadow_of(p.view, lattice, part)
-        came = np.logical_or.reduce([shadow_of(p.view, lattice, a) for a in settled.arrived] or [np.zeros_like(here)])
+        here = shadow_of(p.view, asked)
+        came = np.logical_or.reduce([shadow_of(p.view, body) for body in settled.arrived] or [np.zeros_like(here)])
         shown += int(here.sum())
         left += int((here & p.changed.mask & ~p.explained & ~pixels.dilate(came, 2)).sum())
     return left > ground.believe.touched * shown
