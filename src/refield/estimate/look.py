@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refield.field.kernels.reference import Within
+from refield.field.kernels.reference import EVERYWHERE, Within
 from refield.field.radiance import Field
 from refield.field.render import CHUNK, visible_samples
 from refield.field.sampling import STOP, OccupancySampler
@@ -91,12 +91,12 @@ def _see_all(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
 
 
 def _see(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
-    if hidden is None:
+    if hidden is None and not hasattr(field, "samples_within"):
         samples = visible_samples(field, rays)
         at = samples.positions(rays)
         return shaded(field, at, field.density(at[0]), samples)
 
-    samples, sigmas = reached(field, field.sampler, rays, hidden.grids, inside=False)
+    samples, sigmas = reached(field, field.sampler, rays, () if hidden is None else hidden.grids, inside=False)
     return shaded(field, samples.positions(rays), sigmas, samples)
 
 
@@ -120,6 +120,8 @@ def reached(
 
 
 def _masks(grids: Sequence[OccupancyGrid], inside: bool) -> Within:
+    if not grids:
+        return EVERYWHERE
     sizes = torch.tensor([g.values.numel() for g in grids])
     return Within(
         torch.stack([g.aabb for g in grids]).float(),

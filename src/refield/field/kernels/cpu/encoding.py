@@ -47,6 +47,11 @@ def scratch(name: str, shape: tuple[int, ...], kind: Any = np.float32) -> np.nda
     return known[name][:size].reshape(shape)
 
 
+def held(name: str) -> int:
+    """How many numbers this thread's array by a name can hold; 0 if there is none yet."""
+    return vars(_buffers)[name].size if name in vars(_buffers) else 0
+
+
 @njit(forceinline=True, **JIT)
 def _dense_rows(i, j, k, side, rows, s):  # type: ignore[no-untyped-def]
     base = (i * side + j) * side + k

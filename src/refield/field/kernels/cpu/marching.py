@@ -14,7 +14,7 @@ from numba import get_num_threads, njit, prange
 from torch import Tensor
 
 from refield.field.kernels.cpu.cells import grids_of
-from refield.field.kernels.cpu.encoding import array, encode_part, pairs, parts_of, scratch
+from refield.field.kernels.cpu.encoding import array, encode_part, held, pairs, parts_of, scratch
 from refield.field.kernels.cpu.lanes import new_lanes, next_samples
 from refield.field.kernels.cpu.networks import padded
 from refield.field.kernels.cpu.simd import JIT, exp, product
@@ -313,7 +313,7 @@ def marched(
     width = inside[2].shape[0]
     n = len(rays[0])
     parts = min(4 * get_num_threads(), n // 128 + 1)  # rays differ in length: some parts more than threads
-    room = _ROOM * (n // parts + 1)
+    room = max(_ROOM * (n // parts + 1), held("waves owner") // parts)  # a march that needed more is not the last
     found = np.zeros(parts, np.int64)
     grids = grids_of(grid, fine)
     meant = (*(array(a) for a in within[:4]), within.inside)
