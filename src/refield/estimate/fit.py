@@ -31,6 +31,7 @@ from refield.scene.pose import transform
 from refield.vision import pixels
 
 _HOLDS_MORE = 3.0  # times an object's volume; the hull of one object, carved by few photos, is about twice as large
+_FEW = 3  # poses that are refined to the end, where whether an object is there is asked of the whole
 _MOST_PLACES = 24  # that are tried in a component that holds several objects
 
 
@@ -176,6 +177,27 @@ def _likeliest(
     most = min(ground.believe.fits, found[0].score + 0.1)
     likely = [c.new_from_old for c in found[: ground.believe.refined] if c.score <= most]
     return _refined(ground, old, olds, past, likely, found[0].score, gains)
+
+
+def places_among(
+    ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past], parts: Sequence[Body]
+) -> list[Fit]:
+    """Where an object may be among the newcomers' bodies, the likeliest few, refined; whether it is there is not said.
+
+    What it shows beside that of its outline which is not its own may be more than what is.
+    """
+    sight, found = Sight(ground.field, old, past, olds), list[Candidate]()
+    for target in (t for part in parts for t in targets_of(past, part, old)):
+        found += register(old.cloud, past, target, ground.up, ground.search)
+    found = sorted(found, key=lambda c: c.score)[: ground.believe.refined]
+    rough = [(refine(sight, c.new_from_old, ground.fine, COARSEST), c.score) for c in found]
+    fits: list[Fit] = []
+    for change, score in sorted(((c, s) for c, s in rough if c is not None), key=lambda f: -f[0].explained)[:_FEW]:
+        sharp = replace(sight, detail=_detail(ground, old, past, change.new_from_old))
+        fine = refine(sharp, change.new_from_old, ground.fine, FINER)
+        if fine is not None:
+            fits.append(Fit(score, *trimmed(ground, sharp, fine)))
+    return fits
 
 
 def slid(ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past]) -> Fit | None:

@@ -60,18 +60,19 @@ def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     """
     found = [_left(ground, settled, p) for p in settled.views]
     left, tells = [e for e, _ in found], [t for _, t in found]
-    arrived, came = [], []
-    for body in settled.arrived:
-        shown = [shadow_of(p.view, body, p.depth) for p in settled.views]
+    pixels, smallest = sum(e.size for e in left), ground.believe.smallest
+    arrived, came, least = [], [], (1 - _CAME) * smallest * pixels  # what the smallest thing in all photos would gain
+    for one in settled.arrived:
+        shown = [shadow_of(p.view, one, p.depth) for p in settled.views]
         gain = sum(float((e[here & t] - _CAME).sum()) for here, t, e in zip(shown, tells, left))
-        if gain > 0:
-            arrived.append(body)
+        if gain > least:
+            arrived.append(one)
             came.append(gain / sum(int(here.sum()) for here in shown))
             left = [np.where(here, _CAME, e) for here, e in zip(shown, left)]
-    price = _BODY * ground.believe.smallest * float(np.mean([e.size for e in left] or [0]))
-    bodies = 2 * len(settled.moved) + len(settled.removed)
+    body = _BODY * smallest * pixels / max(len(left), 1)
+    bodies = (2 * len(settled.moved) + len(settled.removed)) * body + len(arrived) * least
     told = replace(settled, arrived=tuple(arrived), came=tuple(came))
-    return told, bodies * price + sum(float(e.sum()) for e in left)
+    return told, bodies + sum(float(e.sum()) for e in left)
 
 
 def _left(ground: Ground, settled: Settled, p: Past) -> tuple[Array, NDArray[np.bool_]]:

@@ -20,7 +20,7 @@ from refield.estimate.associate import may_have_changed, place_all, places_of, w
 from refield.estimate.comoving import with_comoving
 from refield.estimate.consist import consistent
 from refield.estimate.detect import Changed
-from refield.estimate.fit import Fit, at_one_place, believed, gains_enough, left_by, rest_of, slid
+from refield.estimate.fit import Fit, at_one_place, believed, gains_enough, left_by, places_among, rest_of, slid
 from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
 from refield.estimate.lattice import Body, Voxels
@@ -36,7 +36,7 @@ from refield.vision import pixels
 
 _Tries = Callable[[Settled], Iterator[Settled]]
 _Which = tuple[str, int, int]
-_OTHERS = ("elsewhere", "stayed")
+_OTHERS = ("elsewhere", "again", "stayed")
 """what says of an object something else, not the same more exactly"""
 
 
@@ -54,6 +54,8 @@ class Search:
     """the thing that an outline is a piece of"""
     slides: Kept[Fit | None] = field(default_factory=Kept)
     """how an object may have slid"""
+    again: Kept[list[Fit]] = field(default_factory=Kept)
+    """where what left may be among what arrived"""
     outlined: Kept[Old | None] = field(default_factory=Kept)
     """what went along with an object, by its motion"""
     anew: dict[int, Old] = field(default_factory=dict)
@@ -76,9 +78,7 @@ class Search:
                 other, tried[this] = min(others, key=lambda o: o[1], default=(best, math.inf))
                 if tried[this] < least - 1:  # pixel
                     again, best, least, tried = True, other, tried[this], {}
-        still = self.ground.believe.still
-        moved = {k: c for k, c in best.moved.items() if _noticeable(best.olds[k], c, still)}
-        return self._led(replace(best, moved=moved), least, tried)
+        return self._led(best, least, tried)
 
     def _led(self, best: Settled, least: float, tried: dict[_Which, float]) -> Settled:
         """The best hypothesis with how far it leads the other answers for each object that it tells of."""
@@ -93,6 +93,7 @@ class Search:
         changed = (*best.moved, *best.removed)
         return [
             *((("elsewhere", k, 0), partial(self._elsewhere, k=k)) for k in self.fits),
+            *((("again", k, 0), partial(self._again, k=k)) for k in best.removed if best.arrived),
             *((("stayed", k, 0), partial(self._stayed, k=k)) for k in changed),
             *((("outlined", k, 0), partial(self._outlines, k=k)) for k in changed),
             *((("slid", k, id(one)), partial(self._slides, k=k, one=one)) for k, one in self._asked(best)),
@@ -182,6 +183,18 @@ class Search:
                 if change is not None:
                     yield self._with(best, k, fit.old, change, fit.rest)
 
+    def _again(self, best: Settled, k: int) -> Iterator[Settled]:
+        """With an object that left where something arrived: it was looked for before all was known that hides it."""
+        old = best.olds[k]
+        gone, views = self._without(best, k, old)
+        at = [best.moved[j] for j in best.moved]
+        found = self.again.get(
+            (old, *sorted(gone, key=id), *at),
+            lambda: places_among(self.ground, old, gone, views, newcomers(self.ground, views, gone)),
+        )
+        for fit in found:
+            yield self._with(best, k, fit.old, fit.change)
+
     def _stayed(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object less that moved, as it was outlined at first, or as all that changed with it; or as if it had
         not changed at all."""
@@ -259,7 +272,10 @@ def _completed(
     moved: dict[int, PoseChange],
 ) -> Settled:
     """The hypothesis that some of the ``known`` objects moved, with those of the ``touched`` that then left, and what
-    arrived."""
+    arrived. What moved by less than can be seen stayed, and hides what is behind it."""
+    stayed = [k for k, c in moved.items() if not _noticeable(known[k], c, ground.believe.still)]
+    moved = {k: c for k, c in moved.items() if k not in stayed}
+    touched = [k for k in touched if k not in stayed]
     olds = [known[k] for k in sorted(known)]
     placed = [(olds[k], c) for k, c in moved.items()]
     views = without(ground, changed, [olds[k] for k in touched], placed)
