@@ -71,5 +71,7 @@ def test_a_photo_of_something_else_is_rejected_and_the_others_are_used(photos, t
     assert [p.status for p in change.photos] == ["rejected", "used", "used", "used"]
     assert "another scene" in change.photos[0].why
     assert [o.kind for o in change.objects] == ["moved"] and len(change.masks_in) == 3
-    with pytest.raises(InputError, match="is this the same scene"):
-        estimate_change(old, BEFORE, [noise], EstimateConfig(survey=6))
+    again = dataclasses.replace(noise, name="again.png")
+    for others in ([noise], [noise, again, photos[1]]):
+        with pytest.raises(InputError, match="is this the same scene"):
+            estimate_change(old, BEFORE, others, EstimateConfig(survey=6))

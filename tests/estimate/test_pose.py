@@ -26,7 +26,7 @@ from refield.estimate.models import Models
 from refield.estimate.outline import ObjectConfig, remembered
 from refield.estimate.past import changed_share, gone_score, look_past
 from refield.estimate.pose_change import RefineConfig, refine, residuals
-from refield.estimate.register import Target, register, super_fibonacci, turns_about
+from refield.estimate.register import RegisterConfig, Target, register, super_fibonacci, turns_about
 from refield.estimate.settle import looks_gone
 from refield.field.render import render_camera
 from refield.field.source import Known
@@ -108,6 +108,21 @@ def test_registration_finds_the_turn(stage):
     degrees, distance = error(best[0].new_from_old)
     assert degrees < 1.0 and distance < 0.008
     assert best[0].score < 0.4 and all(a.score <= b.score for a, b in pairwise(best))
+
+
+def test_rotations_are_tried_also_where_no_turn_fits(stage):
+    """Turns about an axis that is none of it fit better at a wrong place, as a guess does; the place itself counts."""
+    centre = CRATE.world_from_box[:3, 3]
+    target = Target(
+        np.stack([transform(TRUE, centre).numpy() + 0.02, centre.numpy()]).astype(np.float32),
+        tuple(np.where(p.changed.mask, 0, -1).astype(np.float32) for p in stage.past),
+    )
+    up, guess = np.array([1.0, 0, 0]), [turn(centre, 20, (0.02, 0, 0))]
+    one, more = (
+        register(stage.old.cloud, stage.past, target, up, RegisterConfig(places=k), guess)[0].new_from_old
+        for k in (1, 2)
+    )
+    assert error(one)[0] > 45 and error(more)[0] < 1.0
 
 
 def test_a_pose_of_which_little_can_be_seen_is_worse_than_one_that_is_seen(stage):

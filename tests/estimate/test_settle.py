@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from refield.estimate import recipe, settle
-from refield.estimate.lattice import Body, grown
+from refield.estimate.lattice import Body, grown, some_of
 from refield.estimate.likelihood import Settled, judged, pixels_of
 from refield.scene.pose import angle_between, transform
 from tests.estimate.boxes import BoxWorld, capture_of, new_photos, standing, turn
@@ -89,6 +89,55 @@ def test_a_newcomer_that_explains_nothing_is_taken_back(capture, tmp_path, monke
     bare = replace(found, moved={}, removed={})
     kept, left = judged(ground, replace(bare, arrived=(Body(lattice, corner),)))
     assert kept.arrived == () and left == judged(ground, bare)[1]
+
+
+def test_a_newcomer_that_gains_less_than_the_smallest_thing_would_is_none(capture, tmp_path, monkeypatch):
+    """What is told of is large enough to be seen in each photo; specks of a poor field gain a little as well."""
+    _, (ground, olds, changed, found) = settled(capture, tmp_path, monkeypatch)
+    views = tuple(settle.without(ground, changed, list(olds)))
+    whole = max(settle.newcomers(ground, views, list(olds)), key=lambda body: body.voxels.sum())
+    middle = np.linalg.norm(whole.places - whole.places.mean(0), axis=-1) < 1.5 * whole.lattice.cell
+    speck = replace(whole, voxels=some_of(whole.voxels, middle))
+    bare = replace(found, moved={}, removed={k: 1.0 for k in found.moved}, views=views)
+    nothing, less = judged(ground, bare)[1], judged(ground, replace(bare, arrived=(whole,)))
+    assert less[1] < nothing and less[0].arrived == (whole,)
+    assert judged(ground, replace(bare, arrived=(speck,))) == judged(ground, bare)
+
+
+def test_what_moved_by_less_than_can_be_seen_hides_no_newcomer(capture, tmp_path, monkeypatch):
+    """It stayed, so what is behind it is asked for; else all that is there would be excused by not knowing it."""
+    _, (ground, olds, changed, found) = settled(capture, tmp_path, monkeypatch)
+    ((k, change),) = found.moved.items()
+    barely = replace(change, new_from_old=turn(CENTRE, 0, (0.1 * change.pixel, 0, 0)))
+    monkeypatch.setattr(settle, "place_all", lambda _g, olds, *_: ({k: barely}, dict(olds[1])))
+    once = settle.Search(ground, changed)._placed(olds, Settled())
+    assert once.moved == {} and once.touched == () and not any(p.was.any() for p in once.views)
+
+
+def test_what_was_missed_at_first_is_found_among_what_arrived(capture, tmp_path, monkeypatch):
+    """Told as one that left and one that arrived, an object is looked for again where that is."""
+    _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
+    monkeypatch.setattr(settle, "place_all", lambda _g, olds, *_: ({}, dict(olds[1])))
+    with monkeypatch.context() as without:
+        without.setattr(settle, "places_among", lambda *_: [])
+        missed = settle.Search(ground, changed).settle(olds)
+    assert missed.removed and missed.arrived and not missed.moved
+    found = settle.Search(ground, changed).settle(olds)
+    ((_, change),) = found.moved.items()
+    assert float(angle_between(change.new_from_old, AWAY)) < 1.5 and not found.removed and not found.arrived
+
+
+def test_a_small_thing_among_much_that_changed_is_carved_finely(capture, tmp_path):
+    """On a lattice that holds everything that differs it has too few voxels to be told from a speck."""
+    tin = standing((0.09, 0.08, 0.1), 0.5, 0.45, 10, paint=8)
+    frames = new_photos(BoxWorld((CRATE.moved(AWAY), tin)), tmp_path)
+    coarse = replace(CONFIG, hull=replace(CONFIG.hull, longest=20))
+    change = recipe.estimate_change(capture, BEFORE, frames, coarse)
+    assert sorted(o.kind for o in change.objects) == ["added", "moved"]
+    (added,) = (o for o in change.objects if o.kind == "added")
+    places = added.grid.nodes().reshape(-1, 3)
+    held, true = added.grid.contains(places), tin.inside(places)
+    assert float((held & true).sum() / (held | true).sum()) > 0.5
 
 
 def test_settling_more_keeps_what_was_settled(capture, tmp_path, monkeypatch):

@@ -46,7 +46,7 @@ class RegisterConfig:
     fine_blur: float = 0.03
     """of the object's apparent diameter"""
     places: int = 3
-    """at which all rotations are tried: where turns about the support's normal, or guesses, fit best"""
+    """at which all rotations are tried: where turns about the support's normal, or guesses, fit best, then the first"""
     enough: float = 0.2
     """a score that turns about the support's normal, or a guess, reach; then no other rotation is tried"""
     cap: float = 0.25
@@ -169,7 +169,7 @@ def register(
         every = super_fibonacci(config.rotations)
         at = transform(torch.stack([c.new_from_old for c in found]), torch.from_numpy(middle).double()).numpy()
         nearest = np.linalg.norm(places - at[:, None], axis=-1).argmin(-1)
-        for start in list(dict.fromkeys(nearest.tolist()))[: config.places]:
+        for start in list(dict.fromkeys([*nearest.tolist(), *range(len(places))]))[: config.places]:
             found += search.best(every, np.repeat(places[start][None], len(every), 0))
     poses = torch.stack([c.new_from_old for c in found])
     at = transform(poses, torch.from_numpy(middle).double()).numpy()
