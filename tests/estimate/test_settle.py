@@ -179,6 +179,7 @@ def test_an_object_that_explains_nothing_is_taken_back(capture, tmp_path, monkey
 
     monkeypatch.setattr(settle, "place_all", astray)
     monkeypatch.setattr(settle, "slid", lambda *_: None)
+    monkeypatch.setattr(settle, "places_among", lambda *_: [])
     change, _ = settled(capture, tmp_path, monkeypatch)
     assert sorted(o.kind for o in change.objects) == (["moved"] if known else ["added", "removed"])
     assert not known or float(angle_between(change.objects[0].new_from_old, AWAY)) < 1.5
