@@ -13,7 +13,7 @@ from torch import Tensor
 from refield.estimate.detect import Mask
 from refield.estimate.ground import Ground
 from refield.estimate.hull import HullConfig, look_behind, votes
-from refield.estimate.lattice import Body, Lattice, Voxels, components, grown
+from refield.estimate.lattice import EVERY_WAY, Body, Lattice, Voxels, components, grown
 from refield.estimate.light import Ratio
 from refield.estimate.look import Array, View
 from refield.estimate.objects import Old
@@ -22,14 +22,13 @@ from refield.estimate.past import Past
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
-_EVERY_WAY = np.ones((3, 3, 3), bool)
-
 
 def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> Voxels:
     """Voxels of the hull that newcomers may fill: in every seeing view's unexplained change, and empty once the old are
     gone."""
     hull = ground.hull
-    return _fillable(hull.lattice, ~hull.solid, past, olds, ground.carving) & ground.free
+    empty = _empty(hull.lattice, ~hull.solid, olds) & ground.free
+    return empty & _new(hull.lattice, past, ground.carving, ground.carving.margin)
 
 
 def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list[Body]:
@@ -37,11 +36,10 @@ def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list
 
     Each is carved on a lattice of its own: on the hull's, which holds everything, a small thing has few voxels.
     """
+    out, open_ = list[Body](), [p.open for p in past]
     some = [Body(ground.hull.lattice, part) for part in components(arrivals(ground, past, olds), 1)]
-    some = [body for body in some if any(_speaks(ground, s & p.open) for s, p in zip(_shadows(past, body), past))]
+    some = [body for body in some if any(_speaks(ground, s & o) for s, o in zip(_shadows(past, body), open_))]
     left = [(b, _shadows(past, b)) for body in some for b in _thick(ground, _finer(ground, body, past, olds))]
-    out: list[Body] = []
-    open_ = [p.open for p in past]
     while left:
         left.sort(key=lambda one: -sum(int((here & o).sum()) for here, o in zip(one[1], open_)))
         body, shadows = left.pop(0)
@@ -54,10 +52,9 @@ def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list
     return out
 
 
-def exactly(ground: Ground, body: Body, past: Sequence[Past], olds: Sequence[Old]) -> Body:
+def exactly(ground: Ground, body: Body, past: Sequence[Past]) -> Body:
     """A newcomer without what lies beside the photos' masks, by which it was carved with a margin."""
-    config = replace(ground.carving, margin=0)
-    inside = body.voxels & _fillable(body.lattice, _air(ground, body.lattice, past), past, olds, config)
+    inside = body.voxels & _new(body.lattice, past, ground.carving, 0)
     return replace(body, voxels=inside) if inside.any() else body
 
 
@@ -66,32 +63,32 @@ def _finer(ground: Ground, coarse: Body, past: Sequence[Past], olds: Sequence[Ol
     config, at, reach = ground.carving, coarse.places, coarse.lattice.cell
     pixel = min(float(np.linalg.norm(at - p.view.centre, axis=1).min()) * p.view.pixel_angle for p in past)
     lattice = Lattice.over(at.min(0) - reach, at.max(0) + reach, config.longest, pixel)
+    through, _ = look_behind(lattice.centres.reshape(-1, 3), [*ground.survey, *(p.view for p in past)], config)
     voxels = free_voxels(lattice, ground.planes) & coarse.lattice.holds(grown(coarse.voxels, 1), lattice.centres)
-    return Body(lattice, voxels & _fillable(lattice, _air(ground, lattice, past), past, olds, config))
+    voxels &= _empty(lattice, through.reshape(lattice.shape), olds)
+    return Body(lattice, voxels & _new(lattice, past, config, config.margin))
 
 
-def _air(ground: Ground, lattice: Lattice, past: Sequence[Past]) -> Voxels:
-    """Voxels that some old rendering looks through."""
-    views = [*ground.survey, *(p.view for p in past)]
-    return look_behind(lattice.centres.reshape(-1, 3), views, ground.carving)[0].reshape(lattice.shape)
+def _empty(lattice: Lattice, air: Voxels, olds: Sequence[Old]) -> Voxels:
+    """Voxels that are ``air``, or the place of one of the old."""
+    for old in olds:
+        air = air | old.lattice.holds(grown(old.voxels, 1), lattice.centres)
+    return air
 
 
-def _fillable(lattice: Lattice, air: Voxels, past: Sequence[Past], olds: Sequence[Old], config: HullConfig) -> Voxels:
-    """Voxels in every seeing view's unexplained change that are ``air``, or the place of one of the old."""
-    points, margin = lattice.centres, config.margin
-    flat = points.reshape(-1, 3)
+def _new(lattice: Lattice, past: Sequence[Past], config: HullConfig, margin: int) -> Voxels:
+    """Voxels in every seeing view's unexplained change, grown by ``margin`` pixels."""
+    flat = lattice.centres.reshape(-1, 3)
     seen = [(p.changed.witness(p.depth), p.changed.mask & ~p.explained) for p in past]
     inside, against = votes(flat, [(v, pixels.dilate(m, margin)) for v, m in seen], config)
     sure, _ = votes(flat, [(v, pixels.dilate(p.open, margin)) for (v, _), p in zip(seen, past)], config)
-    for old in olds:
-        air = air | old.lattice.holds(grown(old.voxels, 1), points)
     needed = min(2, len(past))
-    return ((inside >= needed) & (sure >= needed) & (against == 0)).reshape(lattice.shape) & air
+    return ((inside >= needed) & (sure >= needed) & (against == 0)).reshape(lattice.shape)
 
 
 def _thick(ground: Ground, body: Body) -> list[Body]:
     """The parts of a body, without the thin sheets that are left between masks."""
-    core = ndimage.binary_erosion(body.voxels, _EVERY_WAY)
+    core = ndimage.binary_erosion(body.voxels, EVERY_WAY)
     thick = grown(core, 2, body.voxels) if core.any() else core
     return [replace(body, voxels=part) for part in components(thick, ground.carving.smallest)]
 

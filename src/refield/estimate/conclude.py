@@ -51,8 +51,7 @@ class Told:
 def concluded(scene: Told, settled: Settled) -> SceneChange:
     """The estimate's answer: what is believed, why, and what is not understood."""
     olds, frames = settled.olds, scene.frames
-    gone = [olds[k] for k in (*settled.moved, *settled.removed)]
-    came = [exactly(scene.ground, body, settled.views, gone) for body in settled.arrived]
+    came = [exactly(scene.ground, body, settled.views) for body in settled.arrived]
     changes = [_moved(frames, olds[k], change, settled.led[k]) for k, change in settled.moved.items()]
     for k, share in settled.removed.items():
         note = f"{100 * share:.0f} % of its pixels show what is behind it"
@@ -129,8 +128,8 @@ def _unexplained(scene: Told, settled: Settled, came: Sequence[Body]) -> list[Ma
     out = []
     for c, p in zip(scene.changed, settled.views):
         told = pixels.dilate(p.covered, 3) | p.explained | ~p.known
-        for k in (*settled.moved, *settled.removed):
-            told |= pixels.dilate(past.silhouette(c.view, settled.olds[k]), 3)
+        for old in settled.gone:
+            told |= pixels.dilate(past.silhouette(c.view, old), 3)
         for body in came:
             told |= pixels.dilate(shadow_of(c.view, body), 3)
         left = c.mask & ~told
@@ -169,13 +168,12 @@ def _pixel_masks(
         for body in came:
             new |= shadow_of(c.view, body)
         gone = np.zeros(c.view.shape, bool)
-        for k in (*settled.moved, *settled.removed):
-            gone |= past.silhouette(c.view, settled.olds[k])
+        for old in settled.gone:
+            gone |= past.silhouette(c.view, old)
         ins.append(full_size(c.mask & new, c.view.frame))
         outs.append(full_size(pixels.dilate(gone, 1), c.view.frame))
-    olds = [settled.olds[k] for k in (*settled.moved, *settled.removed)]
     for k, change in settled.moved.items():
-        shown = _shown_in(Sight(field, settled.olds[k], settled.views, olds), change.new_from_old)
+        shown = _shown_in(Sight(field, settled.olds[k], settled.views, settled.gone), change.new_from_old)
         ins = [a | shown[i] if i in shown else a for i, a in enumerate(ins)]
     return tuple(ins), tuple(outs)
 

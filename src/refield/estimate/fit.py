@@ -184,7 +184,7 @@ def places_among(
 ) -> list[Fit]:
     """Where an object may be among the newcomers' bodies, the likeliest few, refined; whether it is there is not said.
 
-    What it shows beside that of its outline which is not its own may be more than what is.
+    An outline may hold much that is not the object's, so that few of its pixels are shown even where it is.
     """
     sight, found = Sight(ground.field, old, past, olds), list[Candidate]()
     for target in (t for part in parts for t in targets_of(past, part, old)):
@@ -193,10 +193,8 @@ def places_among(
     rough = [(refine(sight, c.new_from_old, ground.fine, COARSEST), c.score) for c in found]
     fits: list[Fit] = []
     for change, score in sorted(((c, s) for c, s in rough if c is not None), key=lambda f: -f[0].explained)[:_FEW]:
-        sharp = replace(sight, detail=_detail(ground, old, past, change.new_from_old))
-        fine = refine(sharp, change.new_from_old, ground.fine, FINER)
-        if fine is not None:
-            fits.append(Fit(score, *trimmed(ground, sharp, fine)))
+        if (fine := _finished(ground, sight, change)) is not None:
+            fits.append(Fit(score, *fine))
     return fits
 
 
@@ -233,13 +231,19 @@ def _refined(
         change = refine(sight, pose, ground.fine, COARSEST)
         if change is not None and (best is None or change.explained > best.explained + 0.02):
             best = change
-    if best is not None:
-        sight = replace(sight, detail=_detail(ground, old, past, best.new_from_old))
-        best = refine(sight, best.new_from_old, ground.fine, FINER)
-    if best is None:
+    found = None if best is None else _finished(ground, sight, best)
+    if found is None:
         return None
-    old, best = trimmed(ground, sight, best)
+    old, best = found
     return Fit(score, old, best) if believed(ground, old, past, best, gains) else None
+
+
+def _finished(ground: Ground, sight: Sight, rough: PoseChange) -> tuple[Old, PoseChange] | None:
+    """A pose refined to the end, with what old photos show of the object, and the object without what cannot be there;
+    None if no photo shows the place."""
+    sight = replace(sight, detail=_detail(ground, sight.old, sight.past, rough.new_from_old))
+    fine = refine(sight, rough.new_from_old, ground.fine, FINER)
+    return None if fine is None else trimmed(ground, sight, fine)
 
 
 def believed(ground: Ground, old: Old, past: Sequence[Past], change: PoseChange, gains: float | None = None) -> bool:

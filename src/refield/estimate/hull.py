@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from refield.estimate.carve_kernels import Window, count_votes, find_behind, packed
 from refield.estimate.detect import Changed, Mask
-from refield.estimate.lattice import Lattice, Voxels
+from refield.estimate.lattice import EVERY_WAY, Lattice, Voxels
 from refield.estimate.look import Array, View
 from refield.vision import pixels
 
@@ -114,7 +114,7 @@ def _convincing(points: Array, changed: Sequence[Changed], config: HullConfig) -
     ijk, _ = lattice.index(points)
     filled = np.zeros(lattice.shape, bool)
     filled[tuple(ijk.T)] = True
-    labels, count = ndimage.label(filled, np.ones((3, 3, 3)))
+    labels, count = ndimage.label(filled, EVERY_WAY)
     owner = labels[tuple(ijk.T)]
     mass = np.array([_mass(points[owner == k], changed) for k in range(1, count + 1)])
     keep = np.concatenate([[False], mass > config.convincing * mass.max()])

@@ -15,7 +15,7 @@ from refield.estimate.look import Array
 from refield.scene.change import OccupancyGrid
 
 Voxels = NDArray[np.bool_]
-_EVERY_WAY = np.ones((3, 3, 3), bool)
+EVERY_WAY = np.ones((3, 3, 3), bool)
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Body:
 
 def components(voxels: Voxels, smallest: int) -> list[Voxels]:
     """Connected parts (26 neighbours) of at least ``smallest`` voxels, the largest first."""
-    labels, count = ndimage.label(voxels, _EVERY_WAY)
+    labels, count = ndimage.label(voxels, EVERY_WAY)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     sizes[0] = 0
     order = [int(k) for k in np.argsort(-sizes) if sizes[k] >= smallest]
@@ -98,7 +98,7 @@ def grown(voxels: Voxels, steps: int, within: Voxels | None = None) -> Voxels:
     if steps == 0:
         return voxels
     if steps < 0:
-        labels, count = ndimage.label(voxels | (True if within is None else within), _EVERY_WAY)
+        labels, count = ndimage.label(voxels | (True if within is None else within), EVERY_WAY)
         reached = np.zeros(count + 1, bool)
         reached[labels[voxels]] = True
         return reached[labels]

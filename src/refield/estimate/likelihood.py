@@ -51,6 +51,11 @@ class Settled:
     """by index of the old object: pixels that the best other answer for it does not explain and this one does, as a
     part of those that show it or show where it was"""
 
+    @property
+    def gone(self) -> list[Old]:
+        """The old objects that are no longer where they were."""
+        return [self.olds[k] for k in (*self.moved, *self.removed)]
+
 
 def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     """The hypothesis without newcomers that explain no more than they cost; and the pixels, over all new photos, that

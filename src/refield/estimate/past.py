@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -48,13 +49,13 @@ class Past:
     def view(self) -> View:
         return self.changed.view
 
-    @property
+    @cached_property
     def explained(self) -> Mask:
         """Changed pixels that show what was behind."""
         alike = (self.difference < self.changed.threshold).astype(np.uint8)
         return self.changed.mask & self.known & cv2.medianBlur(alike, 5).astype(bool)
 
-    @property
+    @cached_property
     def open(self) -> Mask:
         """Changed pixels that something new must explain."""
         left = self.changed.mask & self.known & ~self.explained

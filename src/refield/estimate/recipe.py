@@ -152,7 +152,7 @@ def estimate_change(
     )  # fmt: skip
     search = Search(ground, scene.changed)
     settled = search.settle(olds)
-    told = [*olds, *(settled.olds[k] for k in (*settled.moved, *settled.removed))]
+    told = [*olds, *settled.gone]
     more = _overlooked(scene, ground, settled, parts, told) if parts.things else []
     if more:
         settled = search.settle([o for o in more if not is_piece(o, [*told, *more])], settled)

@@ -167,14 +167,18 @@ def register(
     found = search.best(likely, centres)
     if found[0].score > config.enough:
         every = super_fibonacci(config.rotations)
-        at = transform(torch.stack([c.new_from_old for c in found]), torch.from_numpy(middle).double()).numpy()
-        nearest = np.linalg.norm(places - at[:, None], axis=-1).argmin(-1)
+        nearest = np.linalg.norm(places - _middles(found, middle)[:, None], axis=-1).argmin(-1)
         for start in list(dict.fromkeys([*nearest.tolist(), *range(len(places))]))[: config.places]:
             found += search.best(every, np.repeat(places[start][None], len(every), 0))
+    rotations = np.stack([c.new_from_old[:3, :3].numpy() for c in found])
+    scores = np.array([c.score for c in found])
+    return [found[k] for k in search.distinct(rotations, _middles(found, middle), scores, 8, 3.0)]
+
+
+def _middles(found: Sequence[Candidate], middle: Array) -> _F64:
+    """Where each of N candidates puts the object's middle (3,), (N, 3)."""
     poses = torch.stack([c.new_from_old for c in found])
-    at = transform(poses, torch.from_numpy(middle).double()).numpy()
-    order = search.distinct(poses[:, :3, :3].numpy(), at, np.array([c.score for c in found]), 8, 3.0)
-    return [found[k] for k in order]
+    return np.asarray(transform(poses, torch.from_numpy(middle).double()).numpy())
 
 
 @dataclass(frozen=True)

@@ -187,9 +187,8 @@ class Search:
         """With an object that left where something arrived: it was looked for before all was known that hides it."""
         old = best.olds[k]
         gone, views = self._without(best, k, old)
-        at = [best.moved[j] for j in best.moved]
         found = self.again.get(
-            (old, *sorted(gone, key=id), *at),
+            (old, *sorted(gone, key=id), *best.moved.values()),
             lambda: places_among(self.ground, old, gone, views, newcomers(self.ground, views, gone)),
         )
         for fit in found:
