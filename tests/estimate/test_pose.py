@@ -125,6 +125,19 @@ def test_rotations_are_tried_also_where_no_turn_fits(stage):
     assert error(one)[0] > 45 and error(more)[0] < 1.0
 
 
+def test_a_place_may_be_known_of_another_point_than_the_middle(stage):
+    """Where the thickest part of an object fits, its middle need not be."""
+    corner = transform(CRATE.world_from_box, torch.tensor([0.5, -0.4, 0.3], dtype=torch.float64))
+    wanted = tuple(np.where(p.changed.mask, 0, -1).astype(np.float32) for p in stage.past)
+    place = transform(TRUE, corner).numpy()[None].astype(np.float32)
+    few, up = RegisterConfig(steps=2), np.array([0, 0, 1.0])
+    known, taken = (
+        register(stage.old.cloud, stage.past, Target(place, wanted, anchor), up, few)[0]
+        for anchor in (corner.numpy(), None)
+    )
+    assert error(known.new_from_old)[0] < 1.0 and known.score < 0.7 * taken.score
+
+
 def test_a_pose_of_which_little_can_be_seen_is_worse_than_one_that_is_seen(stage):
     """Something stands before most of the crate: what is left of it fits as well as the whole does."""
     middle = transform(TRUE, CRATE.world_from_box[:3, 3]).numpy().astype(np.float32)

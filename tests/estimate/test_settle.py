@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from refield.estimate import recipe, settle
+from refield.estimate import fit, recipe, settle
 from refield.estimate.lattice import Body, grown, some_of
+from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_of
 from refield.scene.pose import angle_between, transform
 from tests.estimate.boxes import BoxWorld, capture_of, new_photos, standing, turn
@@ -138,6 +139,43 @@ def test_a_small_thing_among_much_that_changed_is_carved_finely(capture, tmp_pat
     places = added.grid.nodes().reshape(-1, 3)
     held, true = added.grid.contains(places), tin.inside(places)
     assert float((held & true).sum() / (held | true).sum()) > 0.5
+
+
+def test_a_newcomer_is_asked_for_only_where_nothing_hides_it(capture, tmp_path, monkeypatch):
+    """Of one that stands behind something else in every photo, only the rest is shown."""
+    _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
+    views = settle.without(ground, changed, list(olds))
+    whole = max(settle.newcomers(ground, views, list(olds)), key=lambda body: body.voxels.sum())
+    hidden = []
+    for p in views:
+        columns = np.flatnonzero(settle.shadow_of(p.view, whole).any(0))
+        before = np.zeros(p.view.shape, bool)
+        before[:, columns[: round(0.7 * len(columns))]] = True
+        less = replace(p.changed, mask=p.changed.mask & ~before)
+        hidden.append(replace(p, changed=less, depth=np.where(before, 0.1, p.depth).astype(np.float32)))
+    rest = max(settle.newcomers(ground, hidden, list(olds)), key=lambda body: body.voxels.sum())
+    assert settle.fresh(hidden, rest) > 0.8 and whole.lattice.holds(grown(whole.voxels, 1), rest.places).mean() > 0.9
+
+
+def test_a_newcomer_is_judged_by_what_the_photos_show_of_it(capture, tmp_path, monkeypatch):
+    """It is carved with a margin: of a small one, that is more than its own pixels."""
+    _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
+    monkeypatch.setattr(settle, "place_all", lambda _g, olds, *_: ({}, dict(olds[1])))
+    (body,) = settle.Search(ground, changed)._placed(olds, Settled()).arrived
+    views = settle.without(ground, changed, list(olds))
+    shown = [(settle.shadow_of(p.view, body), p.changed.mask) for p in views]
+    assert all((here & ~mask).sum() <= 0.1 * here.sum() for here, mask in shown if here.any())
+
+
+def test_places_that_are_likely_at_first_are_each_refined_to_the_end(capture, tmp_path, monkeypatch):
+    """What looks much alike when it is turned is told apart by what is fine; one place counts once."""
+    _, (ground, (old,), changed, _) = settled(capture, tmp_path, monkeypatch)
+    views, middle = settle.without(ground, changed, [old]), transform(AWAY, CENTRE)
+    near = [turn(middle, degrees, (0.004, 0, 0)) @ AWAY for degrees in (2, -2, 1)]
+    sight = Sight(ground.field, old, views, [old])
+    places = fit._likely(ground, sight, [turn(middle, 180, (0, 0, 0)) @ AWAY, *near])
+    turned = [float(angle_between(change.new_from_old, AWAY)) for _, change in places]
+    assert len(turned) == 2 and turned[0] < 1.5 and turned[1] > 90
 
 
 def test_settling_more_keeps_what_was_settled(capture, tmp_path, monkeypatch):

@@ -94,7 +94,7 @@ def _thick(ground: Ground, body: Body) -> list[Body]:
 
 
 def _shadows(past: Sequence[Past], body: Body) -> list[Mask]:
-    return [shadow_of(p.view, body) for p in past]
+    return [shadow_of(p.view, body, p.depth) for p in past]
 
 
 def _speaks(ground: Ground, mask: Mask) -> bool:
@@ -138,7 +138,7 @@ def _only_light(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
         return False
     alike, shown = 0, 0
     for p in past:
-        here = shadow_of(p.view, part) & p.open
+        here = shadow_of(p.view, part, p.depth) & p.open
         alike += int((here & Ratio.of(p.view, p.rgb, ground.detect).even_and_grey).sum())
         shown += int(here.sum())
     return alike > 0.5 * shown
@@ -146,7 +146,7 @@ def _only_light(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
 
 def fresh(past: Sequence[Past], body: Body) -> float:
     """Part of a newcomer's pixels that nothing else explains, the median over photos that show any."""
-    shadows = [(shadow_of(p.view, body), p.open) for p in past]
+    shadows = [(shadow_of(p.view, body, p.depth), p.open) for p in past]
     shares = [float((here & left).sum() / here.sum()) for here, left in shadows if here.any()]
     return float(np.median(shares)) if shares else 0.0
 

@@ -103,9 +103,10 @@ def _place(
             }
             enough = {k: ground.believe.shown if k in cut else 0.0 for k in some}
             fits |= {k: fit for k, fit in tries.items() if fit is not None and fit.change.explained >= enough[k]}
-            for k, fit in tries.items():
-                if fit is not None and not any(at_one_place(f.change, fit.change, fit.old) for f in found[k]):
-                    found[k].append(fit)
+            for k, best in tries.items():
+                for fit in () if best is None else (best, *best.rivals):
+                    if not any(at_one_place(f.change, fit.change, fit.old) for f in found[k]):
+                        found[k].append(fit)
             if any(fit.change.explained >= ground.believe.shown for fit in fits.values()):
                 break
         if not fits:

@@ -12,7 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from refield.estimate import past, segment
-from refield.estimate.arrive import exactly, fresh, shadow_of
+from refield.estimate.arrive import fresh, shadow_of
 from refield.estimate.confidence import confidence
 from refield.estimate.detect import Changed, Errors, Mask
 from refield.estimate.ground import Ground
@@ -51,24 +51,23 @@ class Told:
 def concluded(scene: Told, settled: Settled) -> SceneChange:
     """The estimate's answer: what is believed, why, and what is not understood."""
     olds, frames = settled.olds, scene.frames
-    came = [exactly(scene.ground, body, settled.views) for body in settled.arrived]
     changes = [_moved(frames, olds[k], change, settled.led[k]) for k, change in settled.moved.items()]
     for k, share in settled.removed.items():
         note = f"{100 * share:.0f} % of its pixels show what is behind it"
         note += "; or it moved, and shows a side that no old photo saw" if settled.arrived else ""
         masks, sure = _masks_of(frames, olds[k]), confidence("removed", settled.led[k], bool(settled.arrived))
         changes.append(ObjectChange("removed", olds[k].shape, masks=masks, confidence=sure, note=note))
-    for body, lead in zip(came, settled.came):
+    for body, lead in zip(settled.arrived, settled.came):
         grid, share = _newcomer(body), fresh(settled.views, body)
         note = f"it hides what was there in {100 * share:.0f} % of its pixels, and nothing that left looks like it"
         masks, sure = segment.masks_in(frames, grid), confidence("added", lead, bool(settled.removed))
         changes.append(ObjectChange("added", grid, masks_in=masks, confidence=sure, note=note))
-    left = _unexplained(scene, settled, came)
+    left = _unexplained(scene, settled)
     reasons = [f"1 {c.kind}{_by(c)}: {c.note}" for c in changes]
     reasons += [_said_of(scene, left)] if left else []
     if not reasons:
         reasons = ["some pixels differ, but no object that moved, left or arrived explains them better than before"]
-    ins, outs = _pixel_masks(scene.ground.field, scene.changed, settled, came) if changes else ((), ())
+    ins, outs = _pixel_masks(scene.ground.field, scene.changed, settled) if changes else ((), ())
     unexplained = tuple(full_size(m, c.view.frame) for m, c in zip(left, scene.changed))
     return SceneChange(tuple(changes), scene.photos, "; ".join(reasons), ins, outs, unexplained)
 
@@ -122,7 +121,7 @@ def _by(o: ObjectChange) -> str:
     return f" by {float(o.shift.norm()):.4g} and turned by {o.turn_deg:.0f} degrees"
 
 
-def _unexplained(scene: Told, settled: Settled, came: Sequence[Body]) -> list[Mask]:
+def _unexplained(scene: Told, settled: Settled) -> list[Mask]:
     """Per photo, the changed pixels that nothing accounts for; nothing at all if they are few, beside the others or
     beside what the field gets wrong in photos that show no change."""
     out = []
@@ -130,7 +129,7 @@ def _unexplained(scene: Told, settled: Settled, came: Sequence[Body]) -> list[Ma
         told = pixels.dilate(p.covered, 3) | p.explained | ~p.known
         for old in settled.gone:
             told |= pixels.dilate(past.silhouette(c.view, old), 3)
-        for body in came:
+        for body in settled.arrived:
             told |= pixels.dilate(shadow_of(c.view, body), 3)
         left = c.mask & ~told
         left = pixels.dilate(pixels.erode(left, 1), 1) & left
@@ -159,13 +158,13 @@ def _newcomer(body: Body) -> OccupancyGrid:
 
 
 def _pixel_masks(
-    field: Field, changed: Sequence[Changed], settled: Settled, came: Sequence[Body]
+    field: Field, changed: Sequence[Changed], settled: Settled
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Per new photo at its full size: what shows that arrived or moved, and where something used to be."""
     ins, outs = [], []
     for c in changed:
         new = np.zeros(c.view.shape, bool)
-        for body in came:
+        for body in settled.arrived:
             new |= shadow_of(c.view, body)
         gone = np.zeros(c.view.shape, bool)
         for old in settled.gone:

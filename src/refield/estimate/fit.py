@@ -46,6 +46,8 @@ class Fit:
     change: PoseChange
     rest: Old | None = None
     """of the outline, where only a part of it was found"""
+    rivals: tuple[Fit, ...] = ()
+    """other poses of it that the photos show as well"""
 
 
 def fit_of(
@@ -174,8 +176,7 @@ def _likeliest(
     found = sorted(found, key=lambda c: c.score)
     if not found:
         return None
-    most = min(ground.believe.fits, found[0].score + 0.1)
-    likely = [c.new_from_old for c in found[: ground.believe.refined] if c.score <= most]
+    likely = [c.new_from_old for c in found[: ground.believe.refined] if c.score <= found[0].score + 0.1]
     return _refined(ground, old, olds, past, likely, found[0].score, gains)
 
 
@@ -186,16 +187,12 @@ def places_among(
 
     An outline may hold much that is not the object's, so that few of its pixels are shown even where it is.
     """
-    sight, found = Sight(ground.field, old, past, olds), list[Candidate]()
+    found: list[Candidate] = []
     for target in (t for part in parts for t in targets_of(past, part, old)):
         found += register(old.cloud, past, target, ground.up, ground.search)
     found = sorted(found, key=lambda c: c.score)[: ground.believe.refined]
-    rough = [(refine(sight, c.new_from_old, ground.fine, COARSEST), c.score) for c in found]
-    fits: list[Fit] = []
-    for change, score in sorted(((c, s) for c, s in rough if c is not None), key=lambda f: -f[0].explained)[:_FEW]:
-        if (fine := _finished(ground, sight, change)) is not None:
-            fits.append(Fit(score, *fine))
-    return fits
+    fine = _likely(ground, Sight(ground.field, old, past, olds), [c.new_from_old for c in found])
+    return [Fit(found[0].score, *one) for one in fine]
 
 
 def slid(ground: Ground, old: Old, olds: Sequence[Old], past: Sequence[Past]) -> Fit | None:
@@ -221,21 +218,26 @@ def _refined(
     score: float,
     gains: float,
 ) -> Fit | None:
-    """The best of some poses of an object, refined; None if the photos do not show it there.
+    """The best of some poses of an object, refined, with its rivals; None if the photos do not show it at any.
 
     ``gains``: the part of its pixels by which they must show more of it than of what was there.
     """
-    best: PoseChange | None = None
-    sight = Sight(ground.field, old, past, olds)
-    for pose in poses:
-        change = refine(sight, pose, ground.fine, COARSEST)
-        if change is not None and (best is None or change.explained > best.explained + 0.02):
-            best = change
-    found = None if best is None else _finished(ground, sight, best)
-    if found is None:
-        return None
-    old, best = found
-    return Fit(score, old, best) if believed(ground, old, past, best, gains) else None
+    likely = _likely(ground, Sight(ground.field, old, past, olds), poses)
+    fits = [Fit(score, *found) for found in likely if believed(ground, found[0], past, found[1], gains)]
+    fits.sort(key=lambda f: -f.change.explained)
+    return replace(fits[0], rivals=tuple(fits[1:])) if fits else None
+
+
+def _likely(ground: Ground, sight: Sight, poses: Sequence[Tensor]) -> list[tuple[Old, PoseChange]]:
+    """The few poses of an object that explain most, each another place, refined to the end: what looks much alike when
+    it is turned is told apart by what is fine."""
+    rough = [refine(sight, pose, ground.fine, COARSEST) for pose in poses]
+    apart: list[PoseChange] = []
+    for change in sorted((c for c in rough if c is not None), key=lambda c: -c.explained):
+        if not any(at_one_place(change, other, sight.old) for other in apart):
+            apart.append(change)
+    fine = [_finished(ground, sight, change) for change in apart[:_FEW]]
+    return [found for found in fine if found is not None]
 
 
 def _finished(ground: Ground, sight: Sight, rough: PoseChange) -> tuple[Old, PoseChange] | None:
@@ -335,18 +337,22 @@ def targets_of(past: Sequence[Past], body: Body, old: Old) -> list[Target]:
         never.append(-out.astype(np.float32))
     inner = ndimage.distance_transform_edt(voxels)
     if voxels.sum() * lattice.cell**3 > _HOLDS_MORE * old.volume:
-        places = _places_in(lattice, inner, old)
+        within = ndimage.distance_transform_edt(old.voxels)
+        places = _places_in(lattice, inner, old, float(within.max()) * old.lattice.cell)
         if len(places) > 1:
-            return [Target(places, tuple(never))]
+            thickest = old.lattice.centres[np.unravel_index(within.argmax(), within.shape)]
+            return [Target(places, tuple(wanted), thickest)]
     middle = lattice.centres[voxels].mean(0)
     bulk = lattice.centres[inner > 0.7 * inner.max()].mean(0)
     centres = [middle] if np.linalg.norm(bulk - middle) < 4 * lattice.cell else [middle, bulk]
     return [Target(c[None].astype(np.float32), tuple(wanted)) for c in centres]
 
 
-def _places_in(lattice: Lattice, inner: Array, old: Old) -> Array:
-    """Spread places (K, 3) where an object's thickest part fits into a component; ``inner``: voxels to its surface."""
-    thickest = float(ndimage.distance_transform_edt(old.voxels).max()) * old.lattice.cell
+def _places_in(lattice: Lattice, inner: Array, old: Old, thickest: float) -> Array:
+    """Spread places (K, 3) where an object's thickest part fits into a component.
+
+    ``inner``: voxels to the component's surface; ``thickest``: of the object, from its surface, world units.
+    """
     fits = np.argwhere(inner * lattice.cell > min(0.8 * thickest, 0.7 * float(inner.max()) * lattice.cell))
     at = lattice.centres[tuple(fits.T)]
     chosen = [int(inner[tuple(fits.T)].argmax())]

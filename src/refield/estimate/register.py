@@ -65,12 +65,14 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Target:
-    """Where to look for an object: where its middle may be, and the pixels it should cover."""
+    """Where to look for an object: where a point of it may be, and the pixels it should cover."""
 
-    centres: Array
+    places: Array
     """(K, 3) world"""
     wanted: tuple[Array, ...]
     """per view (H, W): 1 should be covered, 0 may be, -1 must not be"""
+    anchor: Array | None = None
+    """(3,) the point of the old object, world, that may be at the places; None is the middle of its surface"""
 
 
 def lens_of(view: View) -> _F64:
@@ -155,30 +157,30 @@ def register(
     """
     middle = cloud.points.mean(0)
     radius = float(np.sqrt(((cloud.points - middle) ** 2).sum(-1).mean()))
-    middle_of_all = target.centres.mean(0)
+    middle_of_all = target.places.mean(0)
     away = [max(float(np.linalg.norm(middle_of_all - p.view.centre)), 1e-6) for p in past]
     size = [2 * radius * p.view.camera.fx / d for p, d in zip(past, away)]
     search = _Search(cloud, past, target, middle, radius, size, config)
-    turns, places = turns_about(up, config.turns), np.asarray(target.centres, np.float64)
-    likely, centres = np.tile(turns, (len(places), 1, 1)), np.repeat(places, len(turns), 0)
-    for guess in extra:
-        likely = np.concatenate([likely, guess[:3, :3].numpy()[None]])
-        centres = np.concatenate([centres, (guess[:3, :3].numpy() @ middle + guess[:3, 3].numpy())[None]])
-    found = search.best(likely, centres)
+    turns, places = turns_about(up, config.turns), np.asarray(target.places, np.float64)
+    anchor = middle if target.anchor is None else target.anchor
+    aside = np.asarray(middle, np.float64) - anchor
+    starts = [(turns, place + turns @ aside) for place in places]
+    starts += [(g[None, :3, :3].numpy(), (g[:3, :3].numpy() @ middle + g[:3, 3].numpy())[None]) for g in extra]
+    found = search.best(*(np.concatenate(part) for part in zip(*starts)))
     if found[0].score > config.enough:
         every = super_fibonacci(config.rotations)
-        nearest = np.linalg.norm(places - _middles(found, middle)[:, None], axis=-1).argmin(-1)
+        nearest = np.linalg.norm(places - _put(found, anchor)[:, None], axis=-1).argmin(-1)
         for start in list(dict.fromkeys([*nearest.tolist(), *range(len(places))]))[: config.places]:
-            found += search.best(every, np.repeat(places[start][None], len(every), 0))
+            found += search.best(every, places[start] + every @ aside)
     rotations = np.stack([c.new_from_old[:3, :3].numpy() for c in found])
     scores = np.array([c.score for c in found])
-    return [found[k] for k in search.distinct(rotations, _middles(found, middle), scores, 8, 3.0)]
+    return [found[k] for k in search.distinct(rotations, _put(found, middle), scores, 8, 3.0)]
 
 
-def _middles(found: Sequence[Candidate], middle: Array) -> _F64:
-    """Where each of N candidates puts the object's middle (3,), (N, 3)."""
+def _put(found: Sequence[Candidate], point: Array) -> _F64:
+    """Where each of N candidates puts a point (3,) of the object, (N, 3)."""
     poses = torch.stack([c.new_from_old for c in found])
-    return np.asarray(transform(poses, torch.from_numpy(middle).double()).numpy())
+    return np.asarray(transform(poses, torch.from_numpy(point).double()).numpy())
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from itertools import count
 import numpy as np
 import torch
 
-from refield.estimate.arrive import fresh, newcomers, remarkable, shadow_of
+from refield.estimate.arrive import exactly, fresh, newcomers, remarkable, shadow_of
 from refield.estimate.associate import may_have_changed, place_all, places_of, without
 from refield.estimate.comoving import with_comoving
 from refield.estimate.consist import consistent
@@ -288,7 +288,7 @@ def _completed(
     parts = remarkable(ground, newcomers(ground, views, gone), views, places)
     arrived = [consistent(body, [(v.view, v.open) for v in views]) for body in parts]
     # what its colours leave of it must be as believable as the whole was
-    arrived = [body for body in arrived if fresh(views, body) >= ground.believe.arrived]
+    arrived = [exactly(ground, body, views) for body in arrived if fresh(views, body) >= ground.believe.arrived]
     return Settled(moved, removed, tuple(arrived), tuple(views), tuple(olds), tuple(touched))
 
 
