@@ -30,8 +30,6 @@ class AssociateConfig:
 
     touched: float = 0.5
     """part of an old object's pixels that must have changed for it to be looked for elsewhere"""
-    fits: float = 0.62
-    """worst registration score that is refined"""
     explains: float = 0.5
     """part of the object's pixels that the moved object must explain"""
     shown: float = 0.8
