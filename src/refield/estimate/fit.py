@@ -27,11 +27,12 @@ from refield.estimate.pose_change import COARSEST, FINER, PoseChange, refine, sh
 from refield.estimate.register import Candidate, Target, register
 from refield.estimate.split import halves
 from refield.scene.planes import Plane
-from refield.scene.pose import transform
+from refield.scene.pose import angle_between, transform
 from refield.vision import pixels
 
 _HOLDS_MORE = 3.0  # times an object's volume; the hull of one object, carved by few photos, is about twice as large
-_FEW = 3  # poses that are refined to the end, where whether an object is there is asked of the whole
+_FEW = 3  # poses that are refined to the end
+_ALIKE = 0.02  # of an object's pixels; poses that explain more by less than this explain as much
 _MOST_PLACES = 24  # that are tried in a component that holds several objects
 
 
@@ -220,12 +221,20 @@ def _refined(
 ) -> Fit | None:
     """The best of some poses of an object, refined, with its rivals; None if the photos do not show it at any.
 
+    Of poses that explain as much, that which turns it least: a thing may look the same from several sides.
+
     ``gains``: the part of its pixels by which they must show more of it than of what was there.
     """
     likely = _likely(ground, Sight(ground.field, old, past, olds), poses)
     fits = [Fit(score, *found) for found in likely if believed(ground, found[0], past, found[1], gains)]
-    fits.sort(key=lambda f: -f.change.explained)
+    most = max((f.change.explained for f in fits), default=0.0)
+    fits.sort(key=lambda f: (f.change.explained < most - _ALIKE, _turn(f.change)))
     return replace(fits[0], rivals=tuple(fits[1:])) if fits else None
+
+
+def _turn(change: PoseChange) -> float:
+    """Degrees by which a pose change turns an object."""
+    return float(angle_between(change.new_from_old[:3, :3], torch.eye(3, dtype=torch.float64)))
 
 
 def _likely(ground: Ground, sight: Sight, poses: Sequence[Tensor]) -> list[tuple[Old, PoseChange]]:
