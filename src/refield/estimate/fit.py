@@ -335,15 +335,14 @@ def targets_of(past: Sequence[Past], body: Body, old: Old) -> list[Target]:
     """A component of the arrivals as places to register an object to; those that come later are for when it fails.
 
     Its middle, and where its bulk is thickest. One that is much larger than the object holds others too: then the
-    object may be wherever it fits in, and need not explain the whole.
+    object may be wherever its thickest part fits in.
     """
-    wanted, never = [], []
+    wanted = []
     lattice, voxels = body.lattice, body.voxels
     for p in past:
         here = p.open & shadow_of(p.view, body)
         out = ~pixels.dilate(p.changed.mask | p.changed.light | p.covered, 3)
         wanted.append(here.astype(np.float32) - out.astype(np.float32))
-        never.append(-out.astype(np.float32))
     inner = ndimage.distance_transform_edt(voxels)
     if voxels.sum() * lattice.cell**3 > _HOLDS_MORE * old.volume:
         within = ndimage.distance_transform_edt(old.voxels)
