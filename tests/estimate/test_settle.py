@@ -12,6 +12,8 @@ from refield.estimate.lattice import Body, grown, some_of
 from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_of
 from refield.scene.pose import angle_between, transform
+from refield.scene.srgb import to_linear, to_srgb
+from refield.vision import pixels
 from tests.estimate.boxes import BoxWorld, capture_of, new_photos, standing, turn
 
 CRATE = standing((0.2, 0.17, 0.18), -0.2, -0.15, 20, paint=3)
@@ -105,6 +107,19 @@ def test_a_newcomer_that_gains_less_than_the_smallest_thing_would_is_none(captur
     assert judged(ground, replace(bare, arrived=(speck,))) == judged(ground, bare)
 
 
+def test_what_only_darkens_all_that_is_behind_it_is_no_newcomer(capture, tmp_path, monkeypatch):
+    """However high the space reaches in which no photo contradicts it."""
+    _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
+    views = settle.without(ground, changed, list(olds))
+    body = max(settle.newcomers(ground, views, list(olds)), key=lambda body: body.voxels.sum())
+    shaded = []
+    for p in views:
+        here = pixels.dilate(settle.shadow_of(p.view, body), 6)
+        dark = np.where(here[..., None], to_srgb(0.5 * to_linear(p.rgb)), p.view.photo).astype(np.float32)
+        shaded.append(replace(p, changed=replace(p.changed, view=replace(p.view, photo=dark))))
+    assert settle.newcomers(ground, shaded, list(olds)) == []
+
+
 def test_what_moved_by_less_than_can_be_seen_hides_no_newcomer(capture, tmp_path, monkeypatch):
     """It stayed, so what is behind it is asked for; else all that is there would be excused by not knowing it."""
     _, (ground, olds, changed, found) = settled(capture, tmp_path, monkeypatch)
@@ -173,9 +188,37 @@ def test_places_that_are_likely_at_first_are_each_refined_to_the_end(capture, tm
     views, middle = settle.without(ground, changed, [old]), transform(AWAY, CENTRE)
     near = [turn(middle, degrees, (0.004, 0, 0)) @ AWAY for degrees in (2, -2, 1)]
     sight = Sight(ground.field, old, views, [old])
-    places = fit._likely(ground, sight, [turn(middle, 180, (0, 0, 0)) @ AWAY, *near])
+    poses = [turn(middle, 180, (0, 0, 0)) @ AWAY, *near]
+    assert len(fit._likely(ground, sight, poses)) == 1  # the other is too far behind to become the better one
+    monkeypatch.setattr(fit, "_SHIFTS", 0.5)
+    places = fit._likely(ground, sight, poses)
     turned = [float(angle_between(change.new_from_old, AWAY)) for _, change in places]
     assert len(turned) == 2 and turned[0] < 1.5 and turned[1] > 90
+
+
+def test_poses_that_the_photos_cannot_tell_apart_are_all_told(tmp_path):
+    """A crate of one colour looks the same when it is turned halfway round: that is no doubt about where it is."""
+    plain = replace(CRATE, paint=-1)
+    capture = capture_of(BoxWorld((plain,)), tmp_path / "before")
+    photos = new_photos(BoxWorld((plain.moved(AWAY),)), tmp_path / "after")
+    change = recipe.estimate_change(capture, BoxWorld((plain,)), photos, CONFIG)
+    (moved,) = change.objects
+    assert moved.new_from_old is not None and moved.confidence > 0.8
+    poses = sorted([moved.new_from_old, *moved.alternatives], key=lambda pose: float(angle_between(pose, AWAY)))
+    assert [float(angle_between(pose, AWAY)) for pose in poses] == pytest.approx([0, 180], abs=1.5)
+    assert all(float((transform(pose, CENTRE) - transform(AWAY, CENTRE)).norm()) < 0.02 for pose in poses)
+    assert "would look the same" in change.why
+
+
+def test_an_object_is_put_where_its_thickest_part_fits_among_much_that_arrived(capture, tmp_path, monkeypatch):
+    _, (ground, (old,), changed, _) = settled(capture, tmp_path, monkeypatch)
+    views = settle.without(ground, changed, [old])
+    body = max(settle.newcomers(ground, views, [old]), key=lambda body: body.voxels.sum())
+    small = replace(old, voxels=old.voxels & (old.lattice.centres[..., 2] < 0.08))
+    (target,) = fit.targets_of(views, body, small)
+    assert len(target.places) > 1 and np.allclose(target.anchor, small.thickest[0])
+    assert small.lattice.holds(small.voxels, small.thickest[0][None]).all()
+    assert any((wanted > 0).any() for wanted in target.wanted)
 
 
 def test_settling_more_keeps_what_was_settled(capture, tmp_path, monkeypatch):

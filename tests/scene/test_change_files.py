@@ -29,7 +29,7 @@ def change(tmp_path, capture):
     turn = exp(torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], dtype=torch.float64))
     covariance = torch.eye(6, dtype=torch.float64) * 1e-6
     objects = (
-        ObjectChange("moved", grid, turn, masks, masks[::-1], 0.7, covariance, "a weak match"),
+        ObjectChange("moved", grid, turn, masks, masks[::-1], 0.7, covariance, "a weak match", (turn @ turn,)),
         ObjectChange("removed", grid, masks=masks),
         ObjectChange("added", grid, masks_in=masks),
     )
@@ -66,7 +66,8 @@ def test_round_trip(tmp_path, capture, change):
         assert (a.kind, a.confidence, a.note) == (b.kind, b.confidence, b.note)
         assert same(a.grid.aabb, b.grid.aabb) and same(a.grid.values, b.grid.values)
         assert same(a.masks, b.masks) and same(a.masks_in, b.masks_in)
-        for x, y in ((a.new_from_old, b.new_from_old), (a.covariance, b.covariance)):
+        pairs = ((a.new_from_old, b.new_from_old), (a.covariance, b.covariance))
+        for x, y in (*pairs, *zip(a.alternatives, b.alternatives, strict=True)):
             assert x is y is None or torch.equal(x, y)
     for a, b in zip(change.photos, back.photos, strict=True):
         assert (a.name, a.status, a.why, a.placement) == (b.name, b.status, b.why, b.placement)

@@ -18,6 +18,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+NOT_SHOWN = 2.0
+"""the score of a pose at which the photos show next to nothing of the object"""
+
 _F32 = NDArray[Any]
 _F64 = NDArray[Any]
 _I64 = NDArray[Any]
@@ -311,7 +314,7 @@ def _score(
                     if covered[i // block, j // block] == 0:
                         uncovered += t
     if total < 5:
-        return 2.0
+        return NOT_SHOWN
     return error / total + 0.7 * uncovered / max(wanted, 1.0)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from refield.estimate.arrive import newcomers, remarkable
 from refield.estimate.detect import Changed
-from refield.estimate.fit import Fit, at_one_place, fit_again, fit_of, left_by
+from refield.estimate.fit import Fit, fit_again, fit_of, is_among, left_by
 from refield.estimate.ground import Ground
 from refield.estimate.matched import matched_poses
 from refield.estimate.objects import Old
@@ -105,7 +105,7 @@ def _place(
             fits |= {k: fit for k, fit in tries.items() if fit is not None and fit.change.explained >= enough[k]}
             for k, best in tries.items():
                 for fit in () if best is None else (best, *best.rivals):
-                    if not any(at_one_place(f.change, fit.change, fit.old) for f in found[k]):
+                    if not is_among(fit.change, [f.change for f in found[k]], fit.old):
                         found[k].append(fit)
             if any(fit.change.explained >= ground.believe.shown for fit in fits.values()):
                 break

@@ -25,7 +25,7 @@ from refield.estimate.pose_change import PoseChange
 from refield.field.radiance import Field
 from refield.scene.capture import Frame
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
-from refield.scene.pose import adjoint, rigid, transform
+from refield.scene.pose import adjoint, angle_between, rigid, transform
 from refield.vision import pixels
 
 _NOTABLE = 0.002  # of a photo's pixels; smaller spots that nothing explains are not spoken of
@@ -51,7 +51,7 @@ class Told:
 def concluded(scene: Told, settled: Settled) -> SceneChange:
     """The estimate's answer: what is believed, why, and what is not understood."""
     olds, frames = settled.olds, scene.frames
-    changes = [_moved(frames, olds[k], change, settled.led[k]) for k, change in settled.moved.items()]
+    changes = [_moved(frames, settled, k) for k in settled.moved]
     for k, share in settled.removed.items():
         note = f"{100 * share:.0f} % of its pixels show what is behind it"
         note += "; or it moved, and shows a side that no old photo saw" if settled.arrived else ""
@@ -88,7 +88,8 @@ def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...], err
     return SceneChange((), photos, why, unexplained=tuple(full_size(c.mask, c.view.frame) for c in changed))
 
 
-def _moved(frames: Sequence[Frame], old: Old, change: PoseChange, lead: float) -> ObjectChange:
+def _moved(frames: Sequence[Frame], settled: Settled, k: int) -> ObjectChange:
+    old, change, twins = settled.olds[k], settled.moved[k], settled.twins.get(k, ())
     centre = transform(change.new_from_old, torch.from_numpy(old.centre).double())
     about = adjoint(rigid(torch.eye(3, dtype=torch.float64), centre))
     moved = ObjectChange(
@@ -97,10 +98,18 @@ def _moved(frames: Sequence[Frame], old: Old, change: PoseChange, lead: float) -
         change.new_from_old,
         _masks_of(frames, old),
         segment.masks_in(frames, old.shape.moved(change.new_from_old)),
-        confidence=confidence("moved", lead, False),
+        confidence=confidence("moved", settled.led[k], False),
         covariance=about @ change.covariance @ about.T,
+        alternatives=tuple(twin.new_from_old for twin in twins),
     )
-    return replace(moved, note=_why_moved(change))
+    return replace(moved, note=_why_moved(change) + _or(change, twins))
+
+
+def _or(change: PoseChange, twins: Sequence[PoseChange]) -> str:
+    """What is to be said of poses that the photos show as well."""
+    turns = [angle_between(twin.new_from_old[:3, :3], change.new_from_old[:3, :3]) for twin in twins]
+    degrees = " or ".join(f"{float(turn):.0f}" for turn in turns)
+    return f"; turned by {degrees} degrees more it would look the same" if turns else ""
 
 
 def _masks_of(frames: Sequence[Frame], old: Old) -> tuple[Tensor | None, ...]:

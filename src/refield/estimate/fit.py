@@ -3,7 +3,7 @@ things that one outline may be."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,9 +30,11 @@ from refield.scene.planes import Plane
 from refield.scene.pose import angle_between, transform
 from refield.vision import pixels
 
+ALIKE = 0.02
+"""of an object's pixels; poses that explain more by less than this explain as much"""
 _HOLDS_MORE = 3.0  # times an object's volume; the hull of one object, carved by few photos, is about twice as large
 _FEW = 3  # poses that are refined to the end
-_ALIKE = 0.02  # of an object's pixels; poses that explain more by less than this explain as much
+_SHIFTS = 0.125  # of an object's pixels; what a pose explains changes by no more when it is refined to the end
 _MOST_PLACES = 24  # that are tried in a component that holds several objects
 
 
@@ -104,8 +106,13 @@ def fit_again(ground: Ground, olds: Sequence[Old], past: Sequence[Past], found: 
     for f in found:
         fit = _refined(ground, f.old, olds, past, [f.change.new_from_old], f.score, ground.believe.gains)
         again += [replace(fit, rest=f.rest)] if fit is not None else []
-    best = max(again, key=lambda f: f.change.explained, default=None)
+    best = next(iter(_best_first(again)), None)
     return best if best is not None and best.change.explained >= ground.believe.shown else None
+
+
+def is_among(change: PoseChange, others: Iterable[PoseChange], old: Old) -> bool:
+    """Whether a pose change puts an object at the same place as one of some others."""
+    return any(at_one_place(other, change, old) for other in others)
 
 
 def at_one_place(one: PoseChange, other: PoseChange, old: Old) -> bool:
@@ -141,7 +148,8 @@ def _part_of(
         whole = _refined(ground, old, olds, past, pose, best.score, ground.believe.gains)
         if whole is not None:
             return whole
-    return replace(best, rest=other)
+    rivals = [f for f in best.rivals if f.change.explained >= ground.believe.shown]
+    return replace(best, rest=other, rivals=tuple(replace(f, rest=other) for f in rivals))
 
 
 def left_by(ground: Ground, past: Sequence[Past], old: Old) -> float | None:
@@ -165,7 +173,7 @@ def best_fit(
     found: list[Candidate] = []
     for target in (t for part in parts for t in targets_of(past, part, old)):
         found += register(old.cloud, past, target, ground.up, ground.search, extra)
-        if min(c.score for c in found) <= ground.search.enough:
+        if any(c.score <= ground.search.enough for c in found):
             break
     return _likeliest(ground, old, olds, past, found, ground.believe.gains)
 
@@ -221,15 +229,19 @@ def _refined(
 ) -> Fit | None:
     """The best of some poses of an object, refined, with its rivals; None if the photos do not show it at any.
 
-    Of poses that explain as much, that which turns it least: a thing may look the same from several sides.
-
     ``gains``: the part of its pixels by which they must show more of it than of what was there.
     """
-    likely = _likely(ground, Sight(ground.field, old, past, olds), poses)
-    fits = [Fit(score, *found) for found in likely if believed(ground, found[0], past, found[1], gains)]
-    most = max((f.change.explained for f in fits), default=0.0)
-    fits.sort(key=lambda f: (f.change.explained < most - _ALIKE, _turn(f.change)))
+    likely = _likely(ground, Sight(ground.field, old, past, olds), poses, _asked(ground, old, past))
+    fits = _best_first(Fit(score, *found) for found in likely if believed(ground, found[0], past, found[1], gains))
     return replace(fits[0], rivals=tuple(fits[1:])) if fits else None
+
+
+def _best_first(fits: Iterable[Fit]) -> list[Fit]:
+    """Fits of one object, those that explain most first; of those that explain as much, that which turns it least: a
+    thing may look the same from several sides."""
+    fits = list(fits)
+    most = max((f.change.explained for f in fits), default=0.0)
+    return sorted(fits, key=lambda f: (f.change.explained < most - ALIKE, _turn(f.change)))
 
 
 def _turn(change: PoseChange) -> float:
@@ -237,16 +249,21 @@ def _turn(change: PoseChange) -> float:
     return float(angle_between(change.new_from_old[:3, :3], torch.eye(3, dtype=torch.float64)))
 
 
-def _likely(ground: Ground, sight: Sight, poses: Sequence[Tensor]) -> list[tuple[Old, PoseChange]]:
+def _likely(ground: Ground, sight: Sight, poses: Sequence[Tensor], least: float = 0.0) -> list[tuple[Old, PoseChange]]:
     """The few poses of an object that explain most, each another place, refined to the end: what looks much alike when
-    it is turned is told apart by what is fine."""
+    it is turned is told apart by what is fine. None that could not be the best, nor explain ``least`` of its pixels."""
     rough = [refine(sight, pose, ground.fine, COARSEST) for pose in poses]
     apart: list[PoseChange] = []
     for change in sorted((c for c in rough if c is not None), key=lambda c: -c.explained):
-        if not any(at_one_place(change, other, sight.old) for other in apart):
+        if not is_among(change, apart, sight.old):
             apart.append(change)
-    fine = [_finished(ground, sight, change) for change in apart[:_FEW]]
-    return [found for found in fine if found is not None]
+    out = list[tuple[Old, PoseChange]]()
+    least = max([least - _SHIFTS, *(change.explained - 2 * _SHIFTS for change in apart[:1])])
+    for change in [c for c in apart[:_FEW] if c.explained >= least]:
+        found = _finished(ground, sight, change)
+        if found is not None and not is_among(found[1], [other for _, other in out], found[0]):
+            out.append(found)
+    return out
 
 
 def _finished(ground: Ground, sight: Sight, rough: PoseChange) -> tuple[Old, PoseChange] | None:
@@ -263,10 +280,16 @@ def believed(ground: Ground, old: Old, past: Sequence[Past], change: PoseChange,
     ``gains``: the part of its pixels by which they must show more of it than of what was there.
     """
     believe = ground.believe
-    least = believe.explains * min(1.0, max(0.5, shown_right(ground, old, past) / believe.shown))
+    least = _asked(ground, old, past)
     if is_sunk(ground, old, change):  # possible, off the edge of a table; but a crumb of floor fits anywhere
         least = max(least, believe.sunk)
     return change.explained >= least and gains_enough(ground, change, gains)
+
+
+def _asked(ground: Ground, old: Old, past: Sequence[Past]) -> float:
+    """The part of an object's pixels that a pose must explain: less of one that the old field shows badly."""
+    believe = ground.believe
+    return believe.explains * min(1.0, max(0.5, shown_right(ground, old, past) / believe.shown))
 
 
 def gains_enough(ground: Ground, change: PoseChange, gains: float | None = None) -> bool:
@@ -345,23 +368,21 @@ def targets_of(past: Sequence[Past], body: Body, old: Old) -> list[Target]:
         wanted.append(here.astype(np.float32) - out.astype(np.float32))
     inner = ndimage.distance_transform_edt(voxels)
     if voxels.sum() * lattice.cell**3 > _HOLDS_MORE * old.volume:
-        within = ndimage.distance_transform_edt(old.voxels)
-        places = _places_in(lattice, inner, old, float(within.max()) * old.lattice.cell)
+        places = _places_in(lattice, inner, old)
         if len(places) > 1:
-            thickest = old.lattice.centres[np.unravel_index(within.argmax(), within.shape)]
-            return [Target(places, tuple(wanted), thickest)]
+            return [Target(places, tuple(wanted), old.thickest[0])]
     middle = lattice.centres[voxels].mean(0)
     bulk = lattice.centres[inner > 0.7 * inner.max()].mean(0)
     centres = [middle] if np.linalg.norm(bulk - middle) < 4 * lattice.cell else [middle, bulk]
     return [Target(c[None].astype(np.float32), tuple(wanted)) for c in centres]
 
 
-def _places_in(lattice: Lattice, inner: Array, old: Old, thickest: float) -> Array:
+def _places_in(lattice: Lattice, inner: Array, old: Old) -> Array:
     """Spread places (K, 3) where an object's thickest part fits into a component.
 
-    ``inner``: voxels to the component's surface; ``thickest``: of the object, from its surface, world units.
+    ``inner``: voxels to the component's surface.
     """
-    fits = np.argwhere(inner * lattice.cell > min(0.8 * thickest, 0.7 * float(inner.max()) * lattice.cell))
+    fits = np.argwhere(inner * lattice.cell > min(0.8 * old.thickest[1], 0.7 * float(inner.max()) * lattice.cell))
     at = lattice.centres[tuple(fits.T)]
     chosen = [int(inner[tuple(fits.T)].argmax())]
     nearest = np.linalg.norm(at - at[chosen[0]], axis=-1)

@@ -50,6 +50,8 @@ class Settled:
     led: dict[int, float] = field(default_factory=dict)
     """by index of the old object: pixels that the best other answer for it does not explain and this one does, as a
     part of those that show it or show where it was"""
+    twins: dict[int, tuple[PoseChange, ...]] = field(default_factory=dict)
+    """by index of the old object that moved: other poses at its place that explain as much"""
 
     @property
     def gone(self) -> list[Old]:

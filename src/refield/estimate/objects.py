@@ -117,6 +117,14 @@ class Old:
         return float(np.sqrt(((p - p.mean(0)) ** 2).sum(-1).mean() * 5 / 3))
 
     @cached_property
+    def thickest(self) -> tuple[Array, float]:
+        """The point (3,) world of it that is furthest inside, the middlemost of those that are; and how far."""
+        inner = ndimage.distance_transform_edt(self.voxels)
+        at = self.lattice.centres[inner > inner.max() - 1]
+        middle = at[np.linalg.norm(at - self.centre, axis=-1).argmin()]
+        return middle, float(inner.max()) * self.lattice.cell
+
+    @cached_property
     def outlook(self) -> Outlook:
         """The directions along which old photos looked at it."""
         eyes = torch.from_numpy(np.stack([p.centre for p in self.patches]))

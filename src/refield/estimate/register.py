@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refield.estimate.align_kernels import register_all
+from refield.estimate.align_kernels import NOT_SHOWN, register_all
 from refield.estimate.look import Array, View
 from refield.estimate.objects import Cloud, sides_of
 from refield.estimate.past import Past
@@ -149,7 +149,7 @@ def register(
     config: RegisterConfig = RegisterConfig(),
     extra: Sequence[Tensor] = (),
 ) -> list[Candidate]:
-    """The poses at which the object's surface explains the photos best, best first.
+    """The poses at which the object's surface explains the photos best, best first; none where they show none of it.
 
     Args:
         up: the support's normal, about which objects most often turn.
@@ -174,7 +174,8 @@ def register(
             found += search.best(every, places[start] + every @ aside)
     rotations = np.stack([c.new_from_old[:3, :3].numpy() for c in found])
     scores = np.array([c.score for c in found])
-    return [found[k] for k in search.distinct(rotations, _put(found, middle), scores, 8, 3.0)]
+    apart = search.distinct(rotations, _put(found, middle), scores, 8, 3.0)
+    return [found[k] for k in apart if scores[k] < NOT_SHOWN]
 
 
 def _put(found: Sequence[Candidate], point: Array) -> _F64:

@@ -20,10 +20,20 @@ from refield.estimate.associate import may_have_changed, place_all, places_of, w
 from refield.estimate.comoving import with_comoving
 from refield.estimate.consist import consistent
 from refield.estimate.detect import Changed
-from refield.estimate.fit import Fit, at_one_place, believed, gains_enough, left_by, places_among, rest_of, slid
+from refield.estimate.fit import (
+    ALIKE,
+    Fit,
+    at_one_place,
+    believed,
+    gains_enough,
+    left_by,
+    places_among,
+    rest_of,
+    slid,
+)
 from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
-from refield.estimate.lattice import Body, Voxels
+from refield.estimate.lattice import Body, Voxels, grown
 from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_of
 from refield.estimate.look import Array
@@ -31,7 +41,7 @@ from refield.estimate.objects import Old
 from refield.estimate.outline import standing
 from refield.estimate.past import Past, changed_share
 from refield.estimate.pose_change import FINER, PoseChange, refine
-from refield.scene.pose import transform
+from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
 _Tries = Callable[[Settled], Iterator[Settled]]
@@ -81,18 +91,24 @@ class Search:
         return self._led(best, least, tried)
 
     def _led(self, best: Settled, least: float, tried: dict[_Which, float]) -> Settled:
-        """The best hypothesis with how far it leads the other answers for each object that it tells of."""
-        led = {}
+        """The best hypothesis with how far it leads the other answers for each object that it tells of, and the poses
+        between which the photos do not decide."""
+        led, twins = {}, {}
         for k in (*best.moved, *best.removed):
+            asked = max(pixels_of(self.ground, best, k), 1)
             other = min((left for (kind, j, *_), left in tried.items() if j == k and kind in _OTHERS), default=math.inf)
-            led[k] = (other - least) / max(pixels_of(self.ground, best, k), 1)
-        return replace(best, led=led)
+            led[k] = (other - least) / asked
+            if tried.get(("turned", k, 0), math.inf) - least < ALIKE * asked:
+                told = [(one, judged(self.ground, one)[1]) for one in self._turned(best, k)]
+                twins[k] = tuple(one.moved[k] for one, left in told if k in one.moved and left - least < ALIKE * asked)
+        return replace(best, led=led, twins=twins)
 
     def _exchanges(self, best: Settled) -> list[tuple[_Which, _Tries]]:
         """What is tried beside a hypothesis, each with what tells it from the others."""
         changed = (*best.moved, *best.removed)
         return [
             *((("elsewhere", k, 0), partial(self._elsewhere, k=k)) for k in self.fits),
+            *((("turned", k, 0), partial(self._turned, k=k)) for k in best.moved),
             *((("again", k, 0), partial(self._again, k=k)) for k in best.removed if best.arrived),
             *((("stayed", k, 0), partial(self._stayed, k=k)) for k in changed),
             *((("outlined", k, 0), partial(self._outlines, k=k)) for k in changed),
@@ -177,11 +193,25 @@ class Search:
 
     def _elsewhere(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object at another place at which it was found at any time."""
-        for fit in self.fits[k]:
-            if k not in best.moved or not at_one_place(best.moved[k], fit.change, fit.old):
-                change = self._refined(best, k, fit.old, fit.change)
-                if change is not None:
-                    yield self._with(best, k, fit.old, change, fit.rest)
+        return self._at(best, k, [f for f in self.fits[k] if k not in best.moved or not self._is_turned(best, k, f)])
+
+    def _turned(self, best: Settled, k: int) -> Iterator[Settled]:
+        """With an object turned where it is, as it was found at any time."""
+        turned = [f for f in self.fits[k] if self._is_turned(best, k, f)]
+        return self._at(best, k, [f for f in turned if not at_one_place(best.moved[k], f.change, f.old)])
+
+    def _is_turned(self, best: Settled, k: int, fit: Fit) -> bool:
+        """Whether an object that was found is rather the moved one where it is, however it is turned."""
+        back = invert(best.moved[k].new_from_old) @ fit.change.new_from_old
+        mine, at = best.olds[k], transform(back, torch.from_numpy(fit.old.lattice.centres[fit.old.voxels]).double())
+        return bool(mine.lattice.holds(grown(mine.voxels, 1), at.numpy()).mean() > 0.5)
+
+    def _at(self, best: Settled, k: int, fits: Sequence[Fit]) -> Iterator[Settled]:
+        """With an object where it was found."""
+        for fit in fits:
+            change = self._refined(best, k, fit.old, fit.change)
+            if change is not None:
+                yield self._with(best, k, fit.old, change, fit.rest)
 
     def _again(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object that left where something arrived: it was looked for before all was known that hides it."""

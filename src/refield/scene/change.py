@@ -138,6 +138,9 @@ class ObjectChange:
     ``new_from_old``."""
     note: str = ""
     """Why it is believed, and what the user should know: an unobservable turn, a weak match."""
+    alternatives: tuple[Tensor, ...] = ()
+    """(4, 4) float64 each: other pose changes, at the same place, that the photos show as well as ``new_from_old``: a
+    thing may look the same from several sides. Only for ``moved``."""
 
     def __post_init__(self) -> None:
         if (self.kind == "moved") != (self.new_from_old is not None):

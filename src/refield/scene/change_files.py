@@ -90,6 +90,7 @@ def _object_out(folder: Path, index: int, o: ObjectChange) -> dict[str, Any]:
         "confidence": float(o.confidence),
         "grid": grid,
         "covariance": None if o.covariance is None else o.covariance.tolist(),
+        "alternatives": [pose.tolist() for pose in o.alternatives],
         "note": o.note,
         "masks": _masks_out(folder, f"{index}_old", o.masks),
         "masks_in": _masks_out(folder, f"{index}_new", o.masks_in),
@@ -113,6 +114,7 @@ def _object_in(folder: Path, record: dict[str, Any], capture: Capture | None, ma
         masks_in=_masks_in(folder, record.get("masks_in", [])) if masks else (),
         confidence=float(record["confidence"]),
         covariance=None if covariance is None else _matrix(covariance, 6),
+        alternatives=tuple(_matrix(pose, 4) for pose in record.get("alternatives", [])),
         note=str(record.get("note", "")),
     )
     if capture is not None:
