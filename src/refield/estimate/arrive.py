@@ -22,6 +22,8 @@ from refield.estimate.past import Past
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
+_NEARLY_ALL = 0.95  # of a would-be newcomer's voxels, or of its pixels
+
 
 def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> Voxels:
     """Voxels of the hull that newcomers may fill: in every seeing view's unexplained change, and empty once the old are
@@ -130,18 +132,18 @@ def _rim_of(part: Body, old: Old, new_from_old: Tensor) -> bool:
 
 
 def _only_light(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
-    """Whether a would-be newcomer lies flat on what holds things up and only darkens or brightens it."""
+    """Whether a would-be newcomer only darkens or brightens what is behind it: nearly everywhere, as no thing does by
+    chance; or mostly, and lies flat on what holds things up."""
     points = part.places
     extent = float((points.max(0) - points.min(0)).max())
     low = max(5 * part.lattice.cell, 0.3 * extent)
-    if not any((plane.above(points) <= low).mean() >= 0.95 for plane in ground.planes):
-        return False
+    flat = any((plane.above(points) <= low).mean() >= _NEARLY_ALL for plane in ground.planes)
     alike, shown = 0, 0
     for p in past:
         here = shadow_of(p.view, part, p.depth) & p.open
         alike += int((here & Ratio.of(p.view, p.rgb, ground.detect).even_and_grey).sum())
         shown += int(here.sum())
-    return alike > 0.5 * shown
+    return alike > (0.5 if flat else _NEARLY_ALL) * shown
 
 
 def fresh(past: Sequence[Past], body: Body) -> float:

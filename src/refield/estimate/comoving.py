@@ -90,7 +90,7 @@ def with_comoving(
     parts = [p for p in components(voxels, FEWEST_POINTS) if (p & before).any()]
     if not parts:
         return None
-    return seen_as(lattice, max(parts, key=lambda p: (p & before).sum()), free, patches, ground.shape)
+    return seen_as(lattice, max(parts, key=lambda p: (p & before).sum()), free, patches, ground.planes, ground.shape)
 
 
 def _surfaces(lattice: Lattice, free: Voxels, patches: Sequence[Patch]) -> tuple[Cloud, Voxels]:

@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from scipy import ndimage
+from scipy.spatial import ConvexHull
 
 from refield.estimate.carve_kernels import Window, find_solid, packed
 from refield.estimate.lattice import Lattice, Voxels, components, grown, some_of
-from refield.estimate.look import spread_out
+from refield.estimate.look import Array, spread_out
 from refield.estimate.objects import Old, Patch, corners_of, look_around, surface_cloud
 from refield.field.radiance import Field
 from refield.field.source import Known
@@ -103,7 +104,7 @@ def outline(
         voxels = cut
     if not voxels.any():
         return inner
-    old = seen_as(lattice, voxels, free, patches, config)
+    old = seen_as(lattice, voxels, free, patches, planes, config)
     return old if inner is None else replace(inner, instead=old)
 
 
@@ -150,17 +151,41 @@ def standing(
     voxels = np.logical_or.reduce(parts) if parts else np.zeros_like(solid)
     if not parts or _at_border(voxels):
         return None
-    whole = seen_as(lattice, voxels, free, patches, config)
+    whole = seen_as(lattice, voxels, free, patches, planes, config)
     return whole if whole is not None and whole.volume > _MORE * piece.volume else None
 
 
 def seen_as(
-    lattice: Lattice, voxels: Voxels, free: Voxels, patches: Sequence[Patch], config: ObjectConfig
+    lattice: Lattice,
+    voxels: Voxels,
+    free: Voxels,
+    patches: Sequence[Patch],
+    planes: Sequence[Plane],
+    config: ObjectConfig,
 ) -> Old | None:
-    """Voxels without holes as an object; None if the patches show too little of its surface."""
+    """Voxels without holes, and without what is not between what is seen of them, as an object; None if the patches
+    show too little of its surface."""
     voxels = ndimage.binary_fill_holes(voxels)
     cloud = surface_cloud(lattice, voxels, patches, config.points)
+    if len(cloud.points) >= FEWEST_POINTS:
+        voxels = voxels & _between(lattice, voxels, cloud.points, planes)
+        cloud = surface_cloud(lattice, voxels, patches, config.points)
     return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= FEWEST_POINTS else None
+
+
+def _between(lattice: Lattice, voxels: Voxels, seen: Array, planes: Sequence[Plane]) -> Voxels:
+    """Voxels in the convex hull of what is seen of an object (N, 3) and of what is beneath that, down to what it stands
+    on: where cameras look from some sides only, all that is behind an object might be of it as well."""
+    feet = []
+    for plane in planes:
+        height = plane.above(lattice.centres[voxels])
+        if height.min() < 2 * max(lattice.cell, plane.noise):
+            feet.append(seen - plane.height(seen)[:, None] * plane.normal)
+    corners = np.concatenate([seen, *feet]).astype(np.float64)
+    hull = ConvexHull(corners, qhull_options="QJ").equations.astype(np.float32)
+    at, out = lattice.centres[voxels], voxels.copy()
+    out[voxels] = (at @ hull[:, :3].T + hull[:, 3] <= lattice.cell).all(-1)
+    return out
 
 
 def free_voxels(lattice: Lattice, planes: Sequence[Plane]) -> Voxels:
