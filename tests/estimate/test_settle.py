@@ -42,6 +42,12 @@ def settled(capture, folder, monkeypatch):
     return change, kept[-1]
 
 
+def came_to(ground, olds, changed):
+    """The photos without the old objects, and the largest of what arrived in them."""
+    views = tuple(settle.without(ground, changed, list(olds)))
+    return views, max(settle.newcomers(ground, views, list(olds)), key=lambda body: body.voxels.sum())
+
+
 def test_the_truth_leaves_less_unexplained_than_any_other_hypothesis(capture, tmp_path, monkeypatch):
     _, (ground, _olds, changed, found) = settled(capture, tmp_path, monkeypatch)
     ((k, change),) = found.moved.items()
@@ -97,8 +103,7 @@ def test_a_newcomer_that_explains_nothing_is_taken_back(capture, tmp_path, monke
 def test_a_newcomer_that_gains_less_than_the_smallest_thing_would_is_none(capture, tmp_path, monkeypatch):
     """What is told of is large enough to be seen in each photo; specks of a poor field gain a little as well."""
     _, (ground, olds, changed, found) = settled(capture, tmp_path, monkeypatch)
-    views = tuple(settle.without(ground, changed, list(olds)))
-    whole = max(settle.newcomers(ground, views, list(olds)), key=lambda body: body.voxels.sum())
+    views, whole = came_to(ground, olds, changed)
     middle = np.linalg.norm(whole.places - whole.places.mean(0), axis=-1) < 1.5 * whole.lattice.cell
     speck = replace(whole, voxels=some_of(whole.voxels, middle))
     bare = replace(found, moved={}, removed={k: 1.0 for k in found.moved}, views=views)
@@ -110,8 +115,7 @@ def test_a_newcomer_that_gains_less_than_the_smallest_thing_would_is_none(captur
 def test_what_only_darkens_all_that_is_behind_it_is_no_newcomer(capture, tmp_path, monkeypatch):
     """However high the space reaches in which no photo contradicts it."""
     _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
-    views = settle.without(ground, changed, list(olds))
-    body = max(settle.newcomers(ground, views, list(olds)), key=lambda body: body.voxels.sum())
+    views, body = came_to(ground, olds, changed)
     shaded = []
     for p in views:
         here = pixels.dilate(settle.shadow_of(p.view, body), 6)
@@ -159,8 +163,7 @@ def test_a_small_thing_among_much_that_changed_is_carved_finely(capture, tmp_pat
 def test_a_newcomer_is_asked_for_only_where_nothing_hides_it(capture, tmp_path, monkeypatch):
     """Of one that stands behind something else in every photo, only the rest is shown."""
     _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
-    views = settle.without(ground, changed, list(olds))
-    whole = max(settle.newcomers(ground, views, list(olds)), key=lambda body: body.voxels.sum())
+    views, whole = came_to(ground, olds, changed)
     hidden = []
     for p in views:
         columns = np.flatnonzero(settle.shadow_of(p.view, whole).any(0))
@@ -212,8 +215,7 @@ def test_poses_that_the_photos_cannot_tell_apart_are_all_told(tmp_path):
 
 def test_an_object_is_put_where_its_thickest_part_fits_among_much_that_arrived(capture, tmp_path, monkeypatch):
     _, (ground, (old,), changed, _) = settled(capture, tmp_path, monkeypatch)
-    views = settle.without(ground, changed, [old])
-    body = max(settle.newcomers(ground, views, [old]), key=lambda body: body.voxels.sum())
+    views, body = came_to(ground, [old], changed)
     small = replace(old, voxels=old.voxels & (old.lattice.centres[..., 2] < 0.08))
     (target,) = fit.targets_of(views, body, small)
     assert len(target.places) > 1 and np.allclose(target.anchor, small.thickest[0])

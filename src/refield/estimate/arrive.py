@@ -40,8 +40,8 @@ def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list
     """
     out, open_ = list[Body](), [p.open for p in past]
     some = [Body(ground.hull.lattice, part) for part in components(arrivals(ground, past, olds), 1)]
-    some = [body for body in some if any(_speaks(ground, s & o) for s, o in zip(_shadows(past, body), open_))]
-    left = [(b, _shadows(past, b)) for body in some for b in _thick(ground, _finer(ground, body, past, olds))]
+    some = [body for body in some if any(_speaks(ground, s & o) for s, o in zip(shadows_of(past, body), open_))]
+    left = [(b, shadows_of(past, b)) for body in some for b in _thick(ground, _finer(ground, body, past, olds))]
     while left:
         left.sort(key=lambda one: -sum(int((here & o).sum()) for here, o in zip(one[1], open_)))
         body, shadows = left.pop(0)
@@ -95,7 +95,8 @@ def _thick(ground: Ground, body: Body) -> list[Body]:
     return [replace(body, voxels=part) for part in components(thick, ground.carving.smallest)]
 
 
-def _shadows(past: Sequence[Past], body: Body) -> list[Mask]:
+def shadows_of(past: Sequence[Past], body: Body) -> list[Mask]:
+    """Per photo, the pixels that show a newcomer: those it projects to, where nothing that is known hides it."""
     return [shadow_of(p.view, body, p.depth) for p in past]
 
 
@@ -114,7 +115,7 @@ def remarkable(
 
 def _substantial(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
     """Whether a would-be newcomer is large enough in some photo; what is left over at the edge of others is not."""
-    shadows = _shadows(past, part)
+    shadows = shadows_of(past, part)
     return max(float((s & p.open).mean()) for s, p in zip(shadows, past)) >= ground.believe.smallest
 
 
@@ -139,8 +140,8 @@ def _only_light(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
     low = max(5 * part.lattice.cell, 0.3 * extent)
     flat = any((plane.above(points) <= low).mean() >= _NEARLY_ALL for plane in ground.planes)
     alike, shown = 0, 0
-    for p in past:
-        here = shadow_of(p.view, part, p.depth) & p.open
+    for p, shadow in zip(past, shadows_of(past, part)):
+        here = shadow & p.open
         alike += int((here & Ratio.of(p.view, p.rgb, ground.detect).even_and_grey).sum())
         shown += int(here.sum())
     return alike > (0.5 if flat else _NEARLY_ALL) * shown
@@ -148,8 +149,7 @@ def _only_light(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
 
 def fresh(past: Sequence[Past], body: Body) -> float:
     """Part of a newcomer's pixels that nothing else explains, the median over photos that show any."""
-    shadows = [(shadow_of(p.view, body, p.depth), p.open) for p in past]
-    shares = [float((here & left).sum() / here.sum()) for here, left in shadows if here.any()]
+    shares = [float((here & p.open).sum() / here.sum()) for here, p in zip(shadows_of(past, body), past) if here.any()]
     return float(np.median(shares)) if shares else 0.0
 
 

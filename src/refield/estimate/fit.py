@@ -258,7 +258,8 @@ def _likely(ground: Ground, sight: Sight, poses: Sequence[Tensor], least: float 
         if not is_among(change, apart, sight.old):
             apart.append(change)
     out = list[tuple[Old, PoseChange]]()
-    least = max([least - _SHIFTS, *(change.explained - 2 * _SHIFTS for change in apart[:1])])
+    most = apart[0].explained if apart else 0.0
+    least = max(least, most - _SHIFTS) - _SHIFTS
     for change in [c for c in apart[:_FEW] if c.explained >= least]:
         found = _finished(ground, sight, change)
         if found is not None and not is_among(found[1], [other for _, other in out], found[0]):

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from refield.estimate.arrive import shadow_of
+from refield.estimate.arrive import shadows_of
 from refield.estimate.detect import difference
 from refield.estimate.explain import LIMIT, Compared, relit
 from refield.estimate.ground import Ground
@@ -70,7 +70,7 @@ def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     pixels, smallest = sum(e.size for e in left), ground.believe.smallest
     arrived, came, least = [], [], (1 - _CAME) * smallest * pixels  # what the smallest thing in all photos would gain
     for one in settled.arrived:
-        shown = [shadow_of(p.view, one, p.depth) for p in settled.views]
+        shown = shadows_of(settled.views, one)
         gain = sum(float((e[here & t] - _CAME).sum()) for here, t, e in zip(shown, tells, left))
         if gain > least:
             arrived.append(one)

@@ -151,9 +151,12 @@ class Old:
         return float(self.voxels.sum()) * self.lattice.cell**3
 
     def within(self, other: Old) -> bool:
-        """Whether it is rather a piece of another outline: most of its voxels are in that one, or beside it."""
-        held = other.lattice.holds(grown(other.voxels, 1), self.lattice.centres[self.voxels])
-        return bool(held.mean() > 0.5)
+        """Whether it is rather a piece of another outline."""
+        return other.has_most(self.lattice.centres[self.voxels])
+
+    def has_most(self, points: Array) -> bool:
+        """Whether most world points (N, 3) are in its outline, or beside it."""
+        return bool(self.lattice.holds(grown(self.voxels, 1), points).mean() > 0.5)
 
     @cached_property
     def grid(self) -> OccupancyGrid:

@@ -168,14 +168,14 @@ def seen_as(
     voxels = ndimage.binary_fill_holes(voxels)
     cloud = surface_cloud(lattice, voxels, patches, config.points)
     if len(cloud.points) >= FEWEST_POINTS:
-        voxels = voxels & _between(lattice, voxels, cloud.points, planes)
+        voxels = _between(lattice, voxels, cloud.points, planes)
         cloud = surface_cloud(lattice, voxels, patches, config.points)
     return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= FEWEST_POINTS else None
 
 
 def _between(lattice: Lattice, voxels: Voxels, seen: Array, planes: Sequence[Plane]) -> Voxels:
-    """Voxels in the convex hull of what is seen of an object (N, 3) and of what is beneath that, down to what it stands
-    on: where cameras look from some sides only, all that is behind an object might be of it as well."""
+    """Those of an object's voxels in the convex hull of what is seen of it (N, 3) and of what is beneath that, down to
+    what it stands on: where cameras look from some sides only, all that is behind it might be of it as well."""
     feet = []
     for plane in planes:
         height = plane.above(lattice.centres[voxels])
@@ -183,9 +183,7 @@ def _between(lattice: Lattice, voxels: Voxels, seen: Array, planes: Sequence[Pla
             feet.append(seen - plane.height(seen)[:, None] * plane.normal)
     corners = np.concatenate([seen, *feet]).astype(np.float64)
     hull = ConvexHull(corners, qhull_options="QJ").equations.astype(np.float32)
-    at, out = lattice.centres[voxels], voxels.copy()
-    out[voxels] = (at @ hull[:, :3].T + hull[:, 3] <= lattice.cell).all(-1)
-    return out
+    return some_of(voxels, (lattice.centres[voxels] @ hull[:, :3].T + hull[:, 3] <= lattice.cell).all(-1))
 
 
 def free_voxels(lattice: Lattice, planes: Sequence[Plane]) -> Voxels:

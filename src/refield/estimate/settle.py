@@ -33,7 +33,7 @@ from refield.estimate.fit import (
 )
 from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
-from refield.estimate.lattice import Body, Voxels, grown
+from refield.estimate.lattice import Body, Voxels
 from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_of
 from refield.estimate.look import Array
@@ -203,8 +203,8 @@ class Search:
     def _is_turned(self, best: Settled, k: int, fit: Fit) -> bool:
         """Whether an object that was found is rather the moved one where it is, however it is turned."""
         back = invert(best.moved[k].new_from_old) @ fit.change.new_from_old
-        mine, at = best.olds[k], transform(back, torch.from_numpy(fit.old.lattice.centres[fit.old.voxels]).double())
-        return bool(mine.lattice.holds(grown(mine.voxels, 1), at.numpy()).mean() > 0.5)
+        at = torch.from_numpy(fit.old.lattice.centres[fit.old.voxels]).double()
+        return best.olds[k].has_most(transform(back, at).numpy())
 
     def _at(self, best: Settled, k: int, fits: Sequence[Fit]) -> Iterator[Settled]:
         """With an object where it was found."""
