@@ -1,11 +1,13 @@
 """Light that changed on what did not: told by a surface's own detail, in one photo alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from refield.estimate.detect import Changed, DetectConfig
-from refield.estimate.light import Ratio, same_detail, set_light_aside
+from refield.estimate.light import Ratio, light_of_others, same_detail, set_light_aside
 from refield.estimate.look import View
 from refield.scene.camera import Camera
 from refield.scene.srgb import to_linear, to_srgb
@@ -93,3 +95,28 @@ def test_another_paint_is_a_tint():
     field = pattern(6)
     ratio = Ratio.of(view_of(field[..., ::-1] * np.array([0.5, 1, 1], np.float32), field), field, CONFIG)
     assert ratio.even_and_grey.mean() < 0.1
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_light_of_others_is_that_on_the_same_surface(hidden):
+    """Three cameras side by side before a wall: a shadow on it is in all of them, what stands before it is not."""
+    field, views = pattern(6), []
+    for k in range(3):
+        view = view_of(field, field)
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[0, 3] = 0.2 * k  # 20 pixels on the wall
+        frame = type("F", (), {"world_from_cam": pose, "camera": view.camera, "name": "x"})()
+        away = (1 / view.directions[..., 2]).astype(np.float32)
+        dark = np.ones(view.shape, np.float32)
+        dark[40:80, 50 - 20 * k : 90 - 20 * k] = 0.5
+        photo = to_srgb(to_linear(field) * dark[..., None]).astype(np.float32)
+        views.append(replace(view, frame=frame, photo=photo, depth=away))
+    covered = [np.full(v.shape, hidden) for v in views]
+    ratios = [Ratio.of(v, v.rgb, CONFIG) for v in views]
+    for k, told in enumerate(light_of_others(views, ratios, covered)):
+        if hidden:
+            assert np.isnan(told).all()
+            continue
+        np.testing.assert_allclose(told[45:75, 55 - 20 * k : 85 - 20 * k], np.log(0.5), atol=0.1)  # drawn towards none
+        np.testing.assert_allclose(told[5:30, 40:80], 0, atol=1e-3)
+    assert np.isnan(light_of_others(views[:1], ratios[:1], covered[:1])[0]).all()

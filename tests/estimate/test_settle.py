@@ -124,6 +124,23 @@ def test_what_only_darkens_all_that_is_behind_it_is_no_newcomer(capture, tmp_pat
     assert settle.newcomers(ground, shaded, list(olds)) == []
 
 
+@pytest.mark.parametrize("everywhere", [True, False])
+def test_dappled_light_is_what_every_photo_shows_on_the_same_surface(everywhere, capture, tmp_path, monkeypatch):
+    """However uneven it is; what each photo shows elsewhere stands before the surface."""
+    _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
+    views, body = came_to(ground, olds, changed)
+    photos = []
+    for k, p in enumerate(views):
+        here = pixels.dilate(settle.shadow_of(p.view, body), 6)
+        at = np.where(here[..., None], replace(p.view, depth=p.depth).surface, 0)
+        at = np.where(np.isfinite(at), at, 0) + (np.zeros(3) if everywhere else np.array([0.1 * k, 0, 0]))
+        dapples = 0.55 + 0.4 * np.sin(25 * at[..., 0]) * np.sin(25 * at[..., 1])
+        dark = to_srgb(to_linear(p.rgb) * dapples[..., None])
+        photo = np.where(here[..., None], dark, p.view.photo).astype(np.float32)
+        photos.append(replace(p, changed=replace(p.changed, view=replace(p.view, photo=photo))))
+    assert bool(settle.newcomers(ground, photos, list(olds))) != everywhere
+
+
 def test_what_moved_by_less_than_can_be_seen_hides_no_newcomer(capture, tmp_path, monkeypatch):
     """It stayed, so what is behind it is asked for; else all that is there would be excused by not knowing it."""
     _, (ground, olds, changed, found) = settled(capture, tmp_path, monkeypatch)

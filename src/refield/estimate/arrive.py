@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy import ndimage
 from torch import Tensor
 
-from refield.estimate.detect import Mask
+from refield.estimate.consist import colours_of_others
+from refield.estimate.detect import Mask, difference
+from refield.estimate.explain import LIMIT
 from refield.estimate.ground import Ground
 from refield.estimate.hull import HullConfig, look_behind, votes
 from refield.estimate.lattice import EVERY_WAY, Body, Lattice, Voxels, components, grown
-from refield.estimate.light import Ratio
+from refield.estimate.light import Ratio, brighter, light_of_others
 from refield.estimate.look import Array, View
 from refield.estimate.objects import Old
 from refield.estimate.outline import free_voxels
@@ -22,7 +24,7 @@ from refield.estimate.past import Past
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
-_NEARLY_ALL = 0.95  # of a would-be newcomer's voxels, or of its pixels
+_NEARLY_ALL = 0.95  # of a would-be newcomer's pixels
 
 
 def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> Voxels:
@@ -42,13 +44,14 @@ def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list
     some = [Body(ground.hull.lattice, part) for part in components(arrivals(ground, past, olds), 1)]
     some = [body for body in some if any(_speaks(ground, s & o) for s, o in zip(shadows_of(past, body), open_))]
     left = [(b, shadows_of(past, b)) for body in some for b in _thick(ground, _finer(ground, body, past, olds))]
+    light = _lit(ground, past) if left else []
     while left:
         left.sort(key=lambda one: -sum(int((here & o).sum()) for here, o in zip(one[1], open_)))
         body, shadows = left.pop(0)
         seen = [(here, o, p.known) for here, o, p in zip(shadows, open_, past) if _speaks(ground, here & o)]
         shares = [float((here & o).sum() / (here & known).sum()) for here, o, known in seen]
         enough = len(shares) >= min(2, len(past)) and float(np.median(shares)) > ground.believe.arrived
-        if enough and not _only_light(ground, body, past):
+        if enough and not _only_light(ground, body, past, light):
             out.append(body)
             open_ = [o & ~pixels.dilate(here, 1) for o, here in zip(open_, shadows)]
     return out
@@ -132,19 +135,54 @@ def _rim_of(part: Body, old: Old, new_from_old: Tensor) -> bool:
     return float(near[tuple(ijk[inside].T)].sum()) > 0.5 * len(points)
 
 
-def _only_light(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
-    """Whether a would-be newcomer only darkens or brightens what is behind it: nearly everywhere, as no thing does by
-    chance; or mostly, and lies flat on what holds things up."""
-    points = part.places
-    extent = float((points.max(0) - points.min(0)).max())
-    low = max(5 * part.lattice.cell, 0.3 * extent)
-    flat = any((plane.above(points) <= low).mean() >= _NEARLY_ALL for plane in ground.planes)
-    alike, shown = 0, 0
-    for p, shadow in zip(past, shadows_of(past, part)):
-        here = shadow & p.open
-        alike += int((here & Ratio.of(p.view, p.rgb, ground.detect).even_and_grey).sum())
-        shown += int(here.sum())
-    return alike > (0.5 if flat else _NEARLY_ALL) * shown
+@dataclass(frozen=True)
+class _Lit:
+    """Where a photo shows what is known to stand there, only darker or brighter, (H, W) each."""
+
+    asked: Mask
+    """pixels whose surface other photos see"""
+    alike: Mask
+    """of these, pixels that show it in the light in which the others do"""
+    even: Mask
+    """pixels that show it evenly darker or brighter"""
+
+
+def _lit(ground: Ground, past: Sequence[Past]) -> list[_Lit]:
+    views = [replace(p.view, rgb=p.rgb, depth=p.depth) for p in past]
+    ratios = [Ratio.of(p.view, p.rgb, ground.detect) for p in past]
+    out = []
+    for p, ratio, light in zip(past, ratios, light_of_others(views, ratios, [p.covered for p in past])):
+        asked = np.isfinite(light)
+        alike = _shows(ground, p, brighter(p.rgb, np.where(asked, light, 0)))
+        out.append(_Lit(asked, asked & alike, ratio.even_and_grey))
+    return out
+
+
+def _only_light(ground: Ground, part: Body, past: Sequence[Past], light: Sequence[_Lit]) -> bool:
+    """Whether a would-be newcomer only darkens or brightens what is behind it: mostly by as much as other photos show
+    there, and that tells of more pixels than what they show of the newcomer itself; or evenly nearly everywhere, as no
+    thing does by chance."""
+    here = [shadow & p.open for shadow, p in zip(shadows_of(past, part), past)]
+    if _count(here, [one.even for one in light]) > _NEARLY_ALL * _count(here, here):
+        return True
+    asked = [h & one.asked for h, one in zip(here, light)]
+    alike = [one.alike for one in light]
+    if not any(_speaks(ground, a) for a in asked) or _count(asked, alike) <= 0.5 * _count(asked, asked):
+        return False
+    things = colours_of_others(part, [(p.view, h) for p, h in zip(past, here)])
+    both = [a & np.isfinite(thing[..., 0]) for a, thing in zip(asked, things)]
+    shown = [_shows(ground, p, np.where(b[..., None], thing, p.view.photo)) for p, thing, b in zip(past, things, both)]
+    return _count(both, alike) > _count(both, shown)
+
+
+def _count(some: Sequence[Mask], others: Sequence[Mask]) -> int:
+    """Pixels, over all photos, that are in both."""
+    return sum(int((a & b).sum()) for a, b in zip(some, others))
+
+
+def _shows(ground: Ground, p: Past, picture: Array) -> Mask:
+    """Pixels of a photo that show what a picture (H, W, 3) does."""
+    return difference(p.view, picture, ground.detect) < LIMIT * p.changed.threshold
 
 
 def fresh(past: Sequence[Past], body: Body) -> float:

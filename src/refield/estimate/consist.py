@@ -1,4 +1,4 @@
-"""A newcomer's shape, by the colours that photos agree on (space carving, Kutulakos and Seitz 2000).
+"""A newcomer's shape and surface, by the colours that photos agree on (space carving, Kutulakos and Seitz 2000).
 
 What a few silhouettes allow is about twice the object: a pyramid stands on its top, a skirt around its foot. A voxel of
 that excess is seen against something else by each photo, so their colours disagree.
@@ -44,6 +44,29 @@ def consistent(body: Body, photos: Sequence[tuple[View, Mask]]) -> Body:
     if not parts or parts[0].sum() < _LEAST * begin:
         return body
     return replace(body, voxels=body.voxels & coarse.holds(parts[0], body.lattice.centres))
+
+
+def colours_of_others(body: Body, photos: Sequence[tuple[View, Mask]]) -> list[Array]:
+    """Per photo, the colours that the others show of a body's surface under each pixel, (H, W, 3), the median over
+    those that see it; nan where none does.
+
+    Args:
+        photos: new views, and the pixels (H, W) of each that show the body.
+    """
+    points = body.places
+    seen = [_shown(view, mask, points, body.lattice.cell) for view, mask in photos]
+    shown = [np.where(s[:, None], v.photo[at[:, 1], at[:, 0]], np.nan) for (v, _), (at, s) in zip(photos, seen)]
+    out = []
+    for i, (view, _) in enumerate(photos):
+        at, ours = seen[i]
+        others = shown[:i] + shown[i + 1 :]
+        picture = np.full((*view.shape, 3), np.nan, np.float32)
+        if others:
+            order = np.argsort(-np.linalg.norm(points - view.centre, axis=-1))  # the nearest last
+            order = order[ours[order]]
+            picture[at[order, 1], at[order, 0]] = pixels.median(np.stack(others))[order]
+        out.append(picture)
+    return out
 
 
 def _shown(view: View, mask: Mask, points: Array, cell: float) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import numpy as np
 from refield.estimate.detect import Changed, DetectConfig, Mask, blur_sigma
 from refield.estimate.look import Array, View
 from refield.scene.planes import Plane
-from refield.scene.srgb import to_linear
+from refield.scene.srgb import to_linear, to_srgb
 from refield.vision import pixels
 
 DARK = 0.03
@@ -113,6 +113,34 @@ def _detail(image: Array, sigma: float) -> Array:
 def tint(mean: Array) -> Array:
     """How far, in log units, light that makes a surface brighter by exp(``mean``) changes a channel beyond that."""
     return _GREY + _TINT * np.abs(mean)
+
+
+def brighter(picture: Array, light: Array) -> Array:
+    """A picture (H, W, 3) in so much more light, (H, W) log units, within reason."""
+    most = np.log(LARGEST)
+    return to_srgb(to_linear(picture) * np.exp(np.clip(light, -most, most))[..., None]).astype(np.float32)
+
+
+def light_of_others(views: Sequence[View], ratios: Sequence[Ratio], hidden: Sequence[Mask]) -> list[Array]:
+    """Per view, how much more light the other photos show on the surface under each pixel than the field does there,
+    (H, W) log units, the median over those that see it; nan where none does.
+
+    Args:
+        views: the photos beside what is known to stand there, colours and depth.
+        hidden: (H, W) pixels of each that show something before that.
+    """
+    out = []
+    for i, view in enumerate(views):
+        finite = np.isfinite(view.depth)
+        points = np.where(finite[..., None], view.surface, 0)
+        seen = []
+        for j, other in enumerate(views):
+            if j != i:
+                uv, shown = other.shows(points, SAME_PLACE)
+                shown &= finite & ~other.lookup(hidden[j], uv, shown)
+                seen.append(np.where(shown, other.lookup(ratios[j].mean, uv, shown), np.nan))
+        out.append(pixels.median(np.stack(seen)) if seen else np.full(view.shape, np.nan, np.float32))
+    return out
 
 
 def _agreement(i: int, changed: Sequence[Changed], ratios: Sequence[Ratio]) -> tuple[Array, Array, Array]:

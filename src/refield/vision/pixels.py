@@ -55,6 +55,13 @@ def _nearest_distance(a: Image, b: Image, reach: int) -> Image:
     return np.sqrt(best)
 
 
+def median(images: Image) -> Image:
+    """Over the first axis, that of what is not nan; nan where nothing is."""
+    ordered, count = np.sort(images, 0), np.isfinite(images).sum(0)  # nan last
+    low, high = (np.take_along_axis(ordered, k[None], 0)[0] for k in (np.maximum(count - 1, 0) // 2, count // 2))
+    return np.where(count > 0, (low + high) / 2, np.nan).astype(np.float32)
+
+
 def otsu(values: Image, top: float) -> float:
     """Otsu's threshold of values in [0, top]; larger ones count as ``top``."""
     grey = np.clip(values.reshape(1, -1) * (255 / top), 0, 255).astype(np.uint8)
