@@ -24,6 +24,8 @@ from refield.estimate.past import Past
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
+CAME = 0.7
+"""what a pixel costs that may show anything, since something came there"""
 _NEARLY_ALL = 0.95  # of a would-be newcomer's pixels
 
 
@@ -160,8 +162,8 @@ def _lit(ground: Ground, past: Sequence[Past]) -> list[_Lit]:
 
 def _only_light(ground: Ground, part: Body, past: Sequence[Past], light: Sequence[_Lit]) -> bool:
     """Whether a would-be newcomer only darkens or brightens what is behind it: mostly by as much as other photos show
-    there, and that tells of more pixels than what they show of the newcomer itself; or evenly nearly everywhere, as no
-    thing does by chance."""
+    there, and what they show of the newcomer itself tells of no more pixels than it costs; or evenly nearly everywhere,
+    as no thing does by chance."""
     here = [shadow & p.open for shadow, p in zip(shadows_of(past, part), past)]
     if _count(here, [one.even for one in light]) > _NEARLY_ALL * _count(here, here):
         return True
@@ -172,7 +174,7 @@ def _only_light(ground: Ground, part: Body, past: Sequence[Past], light: Sequenc
     things = colours_of_others(part, [(p.view, h) for p, h in zip(past, here)])
     both = [a & np.isfinite(thing[..., 0]) for a, thing in zip(asked, things)]
     shown = [_shows(ground, p, np.where(b[..., None], thing, p.view.photo)) for p, thing, b in zip(past, things, both)]
-    return _count(both, alike) > _count(both, shown)
+    return _count(both, alike) > _count(both, shown) - least_gain(ground, past)
 
 
 def _count(some: Sequence[Mask], others: Sequence[Mask]) -> int:
@@ -183,6 +185,11 @@ def _count(some: Sequence[Mask], others: Sequence[Mask]) -> int:
 def _shows(ground: Ground, p: Past, picture: Array) -> Mask:
     """Pixels of a photo that show what a picture (H, W, 3) does."""
     return difference(p.view, picture, ground.detect) < LIMIT * p.changed.threshold
+
+
+def least_gain(ground: Ground, past: Sequence[Past]) -> float:
+    """Pixels that a newcomer must explain, over all photos: what the smallest thing in all of them would."""
+    return (1 - CAME) * ground.believe.smallest * sum(p.changed.mask.size for p in past)
 
 
 def fresh(past: Sequence[Past], body: Body) -> float:

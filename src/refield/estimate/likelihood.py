@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from refield.estimate.arrive import shadows_of
+from refield.estimate.arrive import CAME, least_gain, shadows_of
 from refield.estimate.detect import difference
 from refield.estimate.explain import LIMIT, Compared, relit
 from refield.estimate.ground import Ground
@@ -27,8 +27,8 @@ from refield.scene.pose import invert, transform
 _BODY = 3.0
 """times the fewest pixels that a thing must fill in a photo: what one that left costs, for all photos, and again as
 much where it went"""
-_CAME, _UNKNOWN = 0.7, 0.4
-"""what a pixel costs that may show anything, since something came there, or since nobody had seen what is behind"""
+_UNKNOWN = 0.4
+"""what a pixel costs that may show anything, since nobody had seen what is behind"""
 
 
 @dataclass(frozen=True)
@@ -68,14 +68,14 @@ def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     found = [_left(ground, settled, p) for p in settled.views]
     left, tells = [e for e, _ in found], [t for _, t in found]
     pixels, smallest = sum(e.size for e in left), ground.believe.smallest
-    arrived, came, least = [], [], (1 - _CAME) * smallest * pixels  # what the smallest thing in all photos would gain
+    arrived, came, least = [], [], least_gain(ground, settled.views)
     for one in settled.arrived:
         shown = shadows_of(settled.views, one)
-        gain = sum(float((e[here & t] - _CAME).sum()) for here, t, e in zip(shown, tells, left))
+        gain = sum(float((e[here & t] - CAME).sum()) for here, t, e in zip(shown, tells, left))
         if gain > least:
             arrived.append(one)
             came.append(gain / sum(int(here.sum()) for here in shown))
-            left = [np.where(here, _CAME, e) for here, e in zip(shown, left)]
+            left = [np.where(here, CAME, e) for here, e in zip(shown, left)]
     body = _BODY * smallest * pixels / max(len(left), 1)
     bodies = (2 * len(settled.moved) + len(settled.removed)) * body + len(arrived) * least
     told = replace(settled, arrived=tuple(arrived), came=tuple(came))
