@@ -66,3 +66,15 @@ def test_growing_then_shrinking_a_square_gives_it_back(steps):
     mask = np.zeros((16, 16), bool)
     mask[5:9, 6:10] = True
     np.testing.assert_array_equal(pixels.erode(pixels.dilate(mask, steps), steps), mask)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_the_median_leaves_out_what_is_unknown(count):
+    rng = np.random.default_rng(count)
+    images = rng.normal(size=(count, 9, 7)).astype(np.float32)
+    images[rng.random(images.shape) < 0.4] = np.nan
+    images[0, 0], images[:, 1, 1] = 1, np.nan
+    told = pixels.median(images)
+    some = np.isfinite(images).any(0)
+    assert not some[1, 1] and np.isnan(told[~some]).all()
+    np.testing.assert_allclose(told[some], np.nanmedian(images[:, some], 0))
