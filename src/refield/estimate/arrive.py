@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -46,14 +47,14 @@ def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list
     some = [Body(ground.hull.lattice, part) for part in components(arrivals(ground, past, olds), 1)]
     some = [body for body in some if any(_speaks(ground, s & o) for s, o in zip(shadows_of(past, body), open_))]
     left = [(b, shadows_of(past, b)) for body in some for b in _thick(ground, _finer(ground, body, past, olds))]
-    light = _lit(ground, past) if left else []
+    light = cache(partial(_lit, ground, past))
     while left:
         left.sort(key=lambda one: -sum(int((here & o).sum()) for here, o in zip(one[1], open_)))
         body, shadows = left.pop(0)
         seen = [(here, o, p.known) for here, o, p in zip(shadows, open_, past) if _speaks(ground, here & o)]
         shares = [float((here & o).sum() / (here & known).sum()) for here, o, known in seen]
         enough = len(shares) >= min(2, len(past)) and float(np.median(shares)) > ground.believe.arrived
-        if enough and not _only_light(ground, body, past, light):
+        if enough and not _only_light(ground, body, past, shadows, light()):
             out.append(body)
             open_ = [o & ~pixels.dilate(here, 1) for o, here in zip(open_, shadows)]
     return out
@@ -160,11 +161,13 @@ def _lit(ground: Ground, past: Sequence[Past]) -> list[_Lit]:
     return out
 
 
-def _only_light(ground: Ground, part: Body, past: Sequence[Past], light: Sequence[_Lit]) -> bool:
+def _only_light(
+    ground: Ground, part: Body, past: Sequence[Past], shadows: Sequence[Mask], light: Sequence[_Lit]
+) -> bool:
     """Whether a would-be newcomer only darkens or brightens what is behind it: mostly by as much as other photos show
     there, and what they show of the newcomer itself tells of no more pixels than it costs; or evenly nearly everywhere,
     as no thing does by chance."""
-    here = [shadow & p.open for shadow, p in zip(shadows_of(past, part), past)]
+    here = [shadow & p.open for shadow, p in zip(shadows, past)]
     if _count(here, [one.even for one in light]) > _NEARLY_ALL * _count(here, here):
         return True
     asked = [h & one.asked for h, one in zip(here, light)]

@@ -7,7 +7,7 @@ point sees the same ratio. What stands in front of the surface fails the latter,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -131,34 +131,34 @@ def light_of_others(views: Sequence[View], ratios: Sequence[Ratio], hidden: Sequ
     """
     out = []
     for i, view in enumerate(views):
-        finite = np.isfinite(view.depth)
-        points = np.where(finite[..., None], view.surface, 0)
-        seen = []
-        for j, other in enumerate(views):
-            if j != i:
-                uv, shown = other.shows(points, SAME_PLACE)
-                shown &= finite & ~other.lookup(hidden[j], uv, shown)
-                seen.append(np.where(shown, other.lookup(ratios[j].mean, uv, shown), np.nan))
-        out.append(pixels.median(np.stack(seen)) if seen else np.full(view.shape, np.nan, np.float32))
+        seen = [np.full(view.shape, np.nan, np.float32)]
+        for k, uv, shown in _elsewhere(i, views, np.isfinite(view.depth)):
+            shown = shown & ~views[k].lookup(hidden[k], uv, shown)
+            seen.append(np.where(shown, views[k].lookup(ratios[k].mean, uv, shown), np.nan))
+        out.append(pixels.median(np.stack(seen)))
     return out
 
 
 def _agreement(i: int, changed: Sequence[Changed], ratios: Sequence[Ratio]) -> tuple[Array, Array, Array]:
     """How many other views, at the surface under each pixel, see the same ratio; see no change; see that surface."""
-    view = changed[i].view
-    points = view.surface.reshape(-1, 3)
-    ok = np.isfinite(points).all(-1) & changed[i].mask.ravel()
-    points = np.where(ok[:, None], points, 0)
-    agrees, denies, asked = (np.zeros(len(points), np.float32) for _ in range(3))
-    own = ratios[i].each.reshape(-1, 3)
-    for k, other in enumerate(changed):
-        if k == i:
-            continue
-        uv, shown = other.view.shows(points, SAME_PLACE)
-        visible = ok & shown
-        same = np.abs(other.view.lookup(ratios[k].each, uv, shown) - own).max(-1) < _AGREE
-        touched = other.view.lookup(pixels.dilate(other.mask, 1), uv, shown)
-        asked += visible
-        agrees += visible & same
-        denies += visible & ~touched
-    return agrees.reshape(view.shape), denies.reshape(view.shape), asked.reshape(view.shape)
+    views = [c.view for c in changed]
+    agrees, denies, asked = (np.zeros(views[i].shape, np.float32) for _ in range(3))
+    for k, uv, shown in _elsewhere(i, views, changed[i].mask):
+        same = np.abs(views[k].lookup(ratios[k].each, uv, shown) - ratios[i].each).max(-1) < _AGREE
+        touched = views[k].lookup(pixels.dilate(changed[k].mask, 1), uv, shown)
+        asked += shown
+        agrees += shown & same
+        denies += shown & ~touched
+    return agrees, denies, asked
+
+
+def _elsewhere(i: int, views: Sequence[View], asked: Mask) -> Iterator[tuple[int, Array, Mask]]:
+    """Each other view with its pixels (H, W, 2) of the surface under those of view ``i`` that are asked (H, W), and
+    which of these it shows, (H, W)."""
+    points = views[i].surface
+    ok = np.isfinite(points).all(-1) & asked
+    points = np.where(ok[..., None], points, 0)
+    for k, other in enumerate(views):
+        if k != i:
+            uv, shown = other.shows(points, SAME_PLACE)
+            yield k, uv, ok & shown
