@@ -175,14 +175,14 @@ def _pixel_masks(
         new = np.zeros(c.view.shape, bool)
         for body in settled.arrived:
             new |= shadow_of(c.view, body)
-        gone = np.zeros(c.view.shape, bool)
-        for old in settled.gone:
-            gone |= past.silhouette(c.view, old)
         ins.append(full_size(c.mask & new, c.view.frame))
-        outs.append(full_size(pixels.dilate(gone, 1), c.view.frame))
-    for k, change in settled.moved.items():
-        shown = _shown_in(Sight(field, settled.olds[k], settled.views, settled.gone), change.new_from_old)
-        ins = [a | shown[i] if i in shown else a for i, a in enumerate(ins)]
+        outs.append(torch.zeros_like(ins[-1]))
+    for k in (*settled.moved, *settled.removed):
+        places = [(outs, torch.eye(4, dtype=torch.float64))]
+        places += [(ins, settled.moved[k].new_from_old)] if k in settled.moved else []
+        for masks, new_from_old in places:
+            for i, shown in _shown_in(Sight(field, settled.olds[k], settled.views, settled.gone), new_from_old).items():
+                masks[i] = masks[i] | shown
     return tuple(ins), tuple(outs)
 
 

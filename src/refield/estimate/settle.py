@@ -207,11 +207,13 @@ class Search:
         return best.olds[k].has_most(transform(back, at).numpy())
 
     def _at(self, best: Settled, k: int, fits: Sequence[Fit]) -> Iterator[Settled]:
-        """With an object where it was found."""
+        """With an object where it was found, as it was outlined then, or as it is now."""
         for fit in fits:
-            change = self._refined(best, k, fit.old, fit.change)
-            if change is not None:
-                yield self._with(best, k, fit.old, change, fit.rest)
+            now = best.olds[k]
+            for old, rest in [(fit.old, fit.rest), *([] if now is fit.old else [(now, None)])]:
+                change = self._refined(best, k, old, fit.change)
+                if change is not None:
+                    yield self._with(best, k, old, change, rest)
 
     def _again(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object that left where something arrived: it was looked for before all was known that hides it."""
