@@ -26,6 +26,7 @@ from refield.estimate.fit import (
     at_one_place,
     believed,
     gains_enough,
+    is_among,
     left_by,
     places_among,
     rest_of,
@@ -99,8 +100,12 @@ class Search:
             other = min((left for (kind, j, *_), left in tried.items() if j == k and kind in _OTHERS), default=math.inf)
             led[k] = (other - least) / asked
             if tried.get(("turned", k, 0), math.inf) - least < ALIKE * asked:
-                told = [(one, judged(self.ground, one)[1]) for one in self._turned(best, k)]
-                twins[k] = tuple(one.moved[k] for one, left in told if k in one.moved and left - least < ALIKE * asked)
+                apart: list[PoseChange] = []
+                for one in self._turned(best, k):
+                    if k in one.moved and judged(self.ground, one)[1] - least < ALIKE * asked:
+                        found = one.moved[k]
+                        apart += [] if is_among(found, (best.moved[k], *apart), best.olds[k]) else [found]
+                twins[k] = tuple(apart)
         return replace(best, led=led, twins=twins)
 
     def _exchanges(self, best: Settled) -> list[tuple[_Which, _Tries]]:
