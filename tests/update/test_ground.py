@@ -128,12 +128,10 @@ def test_around_what_is_small_beside_the_old_field_s_cells_only_as_much_as_its_r
 def test_a_place_that_is_no_object_s_own_is_as_empty():
     """What two places of an object shared, and only its second visit uncovers."""
     planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]
-    x = torch.tensor([[0.0, 0.0, 0.2], [0.17, 0.0, 0.2]])
+    x = torch.tensor([[0.0, 0.0, 0.2], [0.17, 0.0, 0.2], [0.0, 0.0, -0.09]])
     cells = move_out(SceneChange((box_at(0.0),)), 1.5).sampler(0.02)
-    found = emptiness(SceneChange(()), cells, looking(cells), Region(()), footholds([box_at(0.0).grid], planes))[
-        cells.cells(x)
-    ]
-    assert found.tolist() == [1.0, 0.5]
+    found = emptiness(SceneChange(()), cells, looking(cells), Region(()), footholds([box_at(0.0).grid], planes))
+    assert found[cells.cells(x)].tolist() == [1.0, 0.5, 0.0]
 
 
 def test_a_plane_that_it_did_not_touch_says_nothing():

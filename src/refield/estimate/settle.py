@@ -102,9 +102,9 @@ class Search:
             if tried.get(("turned", k, 0), math.inf) - least < ALIKE * asked:
                 apart: list[PoseChange] = []
                 for one in self._turned(best, k):
-                    if k in one.moved and judged(self.ground, one)[1] - least < ALIKE * asked:
-                        found = one.moved[k]
-                        apart += [] if is_among(found, (best.moved[k], *apart), best.olds[k]) else [found]
+                    alike = k in one.moved and judged(self.ground, one)[1] - least < ALIKE * asked
+                    if alike and not is_among(one.moved[k], (best.moved[k], *apart), best.olds[k]):
+                        apart.append(one.moved[k])
                 twins[k] = tuple(apart)
         return replace(best, led=led, twins=twins)
 
@@ -213,9 +213,12 @@ class Search:
 
     def _at(self, best: Settled, k: int, fits: Sequence[Fit]) -> Iterator[Settled]:
         """With an object where it was found, as it was outlined then, or as it is now."""
+        now = best.olds[k]
         for fit in fits:
-            now = best.olds[k]
-            for old, rest in [(fit.old, fit.rest), *([] if now is fit.old else [(now, None)])]:
+            outlines = [(fit.old, fit.rest)]
+            if now is not fit.old:
+                outlines.append((now, None))
+            for old, rest in outlines:
                 change = self._refined(best, k, old, fit.change)
                 if change is not None:
                     yield self._with(best, k, old, change, rest)

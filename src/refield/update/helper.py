@@ -78,7 +78,7 @@ def emptiness(
     says, and nothing left, there is nothing either. 0 in ``taken``, where something stands now.
     """
     r = cells.resolution
-    depth = torch.zeros(r**3)
+    depth, stood = torch.zeros(r**3), torch.zeros(r**3, dtype=torch.bool)
     cell = 4 * cells.contraction.radius / r
     centres = cells.points_in(torch.arange(r**3), jitter=False)
     left = [o.grid for o in change.objects if o.kind != "added"]
@@ -87,6 +87,7 @@ def emptiness(
         if not len(grid.occupied()):
             continue
         inside = grid.contains(centres)
+        stood |= inside
         if inside.any():  # not of what is thinner than a cell
             distance = distance_transform_edt(inside.reshape(r, r, r).numpy())
             deep = torch.from_numpy(distance).float().reshape(-1) * cell / rim(grid) - 1
@@ -101,7 +102,7 @@ def emptiness(
         off = ((height.abs() - 2 * foothold.plane.noise) / band).clamp(0, 1)
         here = (height.abs() < band) & foothold.holds(centres)
         depth[here] = torch.maximum(depth[here], _RIM * off[here])
-    depth[~(before.occupied(centres) | Region(tuple(left)).contains(centres))] = 1.0
+    depth[~(before.occupied(centres) | stood)] = 1.0
     return torch.where(taken.contains(centres), 0.0, depth) if taken.grids else depth
 
 
