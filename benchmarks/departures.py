@@ -24,6 +24,7 @@ from refield.evaluate import evaluate
 from refield.update.composite import UpdatedField
 from refield.update.config import UpdateConfig
 from refield.update.cut import CutConfig
+from refield.update.frozen import FreezeConfig
 from refield.update.ground import GroundConfig
 from refield.update.relight import RelightConfig
 from refield.update.spared import ShowConfig
@@ -41,6 +42,7 @@ OFF: dict[str, UpdateConfig] = {
     "ground.footholds": replace(DEFAULT, ground=GroundConfig(footholds=False)),
     "ground.textured": replace(DEFAULT, ground=GroundConfig(textured=False)),
     "ground.patterned": replace(DEFAULT, ground=GroundConfig(patterned=False)),
+    "freeze.unseen": replace(DEFAULT, freeze=FreezeConfig(unseen=False)),
     "fit.emptiness 0": replace(DEFAULT, fit=replace(PATIENT, emptiness=0.0)),
     "fit.directions": replace(DEFAULT, fit=replace(PATIENT, directions=True)),
     "show.spared": replace(DEFAULT, show=ShowConfig(spared=False)),
@@ -49,6 +51,7 @@ OFF: dict[str, UpdateConfig] = {
         relight=RelightConfig(still=False, moved=False),
         supervise=SuperviseConfig(exposure=False),
         ground=GroundConfig(footholds=False, textured=False, patterned=False),
+        freeze=FreezeConfig(unseen=False),
         fit=replace(PATIENT, emptiness=0.0, directions=True),
         show=ShowConfig(spared=False),
     ),

@@ -72,8 +72,9 @@ def found(
     lessons: Lessons, plane: Plane = LEVEL, unsure: Region = NOWHERE, patterned: bool = True
 ) -> tuple[TexturedPlane, ...]:
     cut = UpdatedField(BallWorld((OLD,)), CHANGE)
+    dark = replace(cut.sampler, grid=torch.zeros_like(cut.sampler.grid))
     ground = footholds([CHANGE.objects[0].grid], [plane])
-    return textured_planes(ground, move_out(CHANGE, 2.0), cut, unsure, lessons, PIXEL, patterned=patterned)
+    return textured_planes(ground, move_out(CHANGE, 2.0), cut, dark, unsure, lessons, PIXEL, patterned=patterned)
 
 
 def seen(plane: TexturedPlane, truth: Field, radius: float = 1.0) -> tuple[float, float]:
@@ -160,9 +161,10 @@ def test_half_of_the_ground_may_be_out_of_sight() -> None:
 def test_places_far_apart_have_textures_of_their_own() -> None:
     far = grid_of(Ball(at(0.9, 0.9, 0.1), 0.1))
     cut = UpdatedField(BallWorld((OLD,)), CHANGE)
+    dark = replace(cut.sampler, grid=torch.zeros_like(cut.sampler.grid))
     around = Region((CHANGE.objects[0].grid.dilated(1.5), far.dilated(1.5)))
     ground = footholds([CHANGE.objects[0].grid], [LEVEL])
-    planes = textured_planes(ground, around, cut, NOWHERE, photos(AFTER, [0.4]), PIXEL)
+    planes = textured_planes(ground, around, cut, dark, NOWHERE, photos(AFTER, [0.4]), PIXEL)
     assert len(planes) == 2 and all(seen(p, AFTER, 3.0)[0] > 33 for p in planes)
 
 

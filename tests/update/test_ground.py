@@ -11,6 +11,7 @@ from refield.scene.planes import Plane
 from refield.update.ground import Foothold, footholds, planes_around
 from refield.update.helper import emptiness
 from refield.update.region import Region, meets, move_out
+from refield.update.unseen import Sight
 
 EYES = torch.tensor([[1.0, 0, 1], [-1, 0, 1], [0, 1, 1], [0, -1, 1.2]])
 
@@ -32,15 +33,10 @@ def grids_of(change):
     return [o.grid for o in change.objects]
 
 
-def looking(cells):
-    """Everywhere, as the old field's sampler may."""
-    return replace(cells, grid=torch.ones_like(cells.grid))
-
-
 def asked(change, x, planes, taken=()):
     """What `emptiness` says at world points (N, 3)."""
     cells = move_out(change, 1.5).sampler(0.02)
-    return emptiness(change, cells, looking(cells), Region(taken), footholds(grids_of(change), planes))[cells.cells(x)]
+    return emptiness(change, cells, Region(taken), footholds(grids_of(change), planes))[cells.cells(x)]
 
 
 def test_the_floor_is_found_around_what_left():
@@ -73,12 +69,12 @@ def test_above_the_floor_that_it_stood_on_is_nothing():
     assert (asked(standing, outside, planes) == 0).all()
 
 
-def test_just_beneath_the_floor_is_nothing_either_the_less_so_the_nearer():
+def test_beneath_the_floor_is_nothing_either_the_less_so_the_nearer():
     standing = SceneChange((box_at(0.0),))
     planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]
     under = torch.tensor([[0.0, 0.0, z] for z in (0.0, -0.03, -0.09)])
     at, near, deep = asked(standing, under, planes).tolist()
-    assert at < 0.1 < near < 0.5 and deep == 0  # a table's legs are no mist
+    assert at < 0.1 < near < 0.5 == deep
     assert (asked(standing, under, ()) == 0).all()
     beside = torch.tensor([[0.3, 0.0, -0.09]])
     assert (asked(standing, beside, planes) == 0).all()  # the edge of a table, as far as is known
@@ -96,13 +92,15 @@ def test_rays_enter_the_ground_where_the_object_stood_and_only_from_above():
     assert isinstance(foothold, Foothold) and foothold.holds(torch.tensor([[0.0, 0.0, -5.0]])).all()
 
 
-def test_where_the_old_field_does_not_look_nothing_is_but_what_arrived():
-    change = SceneChange((box_at(0.0),))
-    cells = move_out(change, 1.5).sampler(0.02)
-    blind = replace(cells, grid=torch.zeros_like(cells.grid))
-    x = torch.tensor([[0.26, 0.0, 0.2], [0.17, 0.0, 0.2], [-0.26, 0.0, 0.2]])  # beside what left, in it, what arrived
-    arrived = OccupancyGrid(torch.tensor([[-0.3, -0.1, 0.1], [-0.2, 0.1, 0.3]]), torch.ones(3, 3, 3))
-    assert emptiness(change, cells, blind, Region((arrived,)))[cells.cells(x)].tolist() == [1.0, 0.0, 0.0]
+def test_what_was_looked_through_is_empty_and_what_was_seen_beneath_the_floor_may_be_there():
+    cells = move_out(SceneChange((box_at(0.0),)), 1.5).sampler(0.02)
+    planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]
+    x = torch.tensor([[0.26, 0.0, 0.2], [0.05, 0.05, -0.09], [-0.05, 0.05, -0.09]])
+    free, hidden, leg = cells.cells(x)
+    empty = replace(cells, grid=torch.zeros_like(cells.grid))
+    sight = Sight(empty, torch.stack([free, hidden, leg]), torch.tensor([3.0, -3.0, -1.0]))
+    found = emptiness(SceneChange((box_at(0.0),)), cells, Region(()), footholds([box_at(0.0).grid], planes), sight)
+    assert found[free] == 1 and found[hidden] == 0.5 and found[leg] == 0
 
 
 def test_the_skin_that_the_old_field_shows_around_what_left_is_as_empty_as_its_rim():
@@ -111,8 +109,9 @@ def test_the_skin_that_the_old_field_shows_around_what_left_is_as_empty_as_its_r
     x = torch.tensor([[0.22, 0.0, 0.2], [0.28, 0.0, 0.2], [0.0, 0.22, -0.04]])  # its side is at 0.19
     coarse = replace(cells, grid=torch.ones(32, 32, 32, dtype=torch.uint8))
     assert 0.03 < coarse.width(torch.tensor(0.5)) < 0.05
+    seen = Sight(coarse, torch.tensor([], dtype=torch.long), torch.tensor([]))
     for ground, tolls in ((footholds([box_at(0.0).grid], planes), [0.5, 0.0, 0.0]), ((), [0.0, 0.0, 0.0])):
-        found = emptiness(SceneChange((box_at(0.0),)), cells, coarse, Region(()), ground)
+        found = emptiness(SceneChange((box_at(0.0),)), cells, Region(()), ground, seen)
         assert found[cells.cells(x)].tolist() == tolls
 
 
@@ -120,8 +119,9 @@ def test_around_what_is_small_beside_the_old_field_s_cells_only_as_much_as_its_r
     cells = move_out(SceneChange((box_at(0.0),)), 1.5).sampler(0.02)
     planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]
     huge = replace(cells, grid=torch.ones(4, 4, 4, dtype=torch.uint8))
+    seen = Sight(huge, torch.tensor([], dtype=torch.long), torch.tensor([]))
     x = torch.tensor([[0.21, 0.0, 0.2], [0.26, 0.0, 0.2]])  # its side is at 0.19, its rim 0.05 deep
-    found = emptiness(SceneChange((box_at(0.0),)), cells, huge, Region(()), footholds([box_at(0.0).grid], planes))
+    found = emptiness(SceneChange((box_at(0.0),)), cells, Region(()), footholds([box_at(0.0).grid], planes), seen)
     assert found[cells.cells(x)].tolist() == [0.5, 0.0]
 
 
@@ -130,8 +130,8 @@ def test_a_place_that_is_no_object_s_own_is_as_empty():
     planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]
     x = torch.tensor([[0.0, 0.0, 0.2], [0.17, 0.0, 0.2], [0.0, 0.0, -0.09]])
     cells = move_out(SceneChange((box_at(0.0),)), 1.5).sampler(0.02)
-    found = emptiness(SceneChange(()), cells, looking(cells), Region(()), footholds([box_at(0.0).grid], planes))
-    assert found[cells.cells(x)].tolist() == [1.0, 0.5, 0.0]
+    found = emptiness(SceneChange(()), cells, Region(()), footholds([box_at(0.0).grid], planes))[cells.cells(x)]
+    assert found.tolist() == [1.0, 0.5, 0.5]
 
 
 def test_a_plane_that_it_did_not_touch_says_nothing():

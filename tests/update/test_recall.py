@@ -106,6 +106,20 @@ def test_what_a_helper_has_learnt_of_an_object_is_looked_up_there():
     assert source_of(part, grid_of(ball(THERE))) is None
 
 
+def test_what_was_not_shown_is_not_shown_when_the_object_leaves_again():
+    _, now = first_visit()
+    beside = THERE[:3, 3].float() + torch.tensor([0.15, 0.0, -0.29])  # in the floor
+    cell = now.sampler.cells(beside)[None]
+    assert now.sampler.occupied(beside)
+    dark = now.unshown(cell)
+    assert not dark.sampler.occupied(beside)
+    change = SceneChange((next_move(BEYOND),))
+    for state, shown in ((now, True), (dark, False)):
+        base, earlier = earlier_of(state, change, 1.5)
+        assert earlier.places.contains(beside[None]).all()
+        assert bool(UpdatedField(base, change, earlier=earlier).sampler.occupied(beside)) == shown
+
+
 def test_a_move_that_is_taken_back_gives_the_old_pictures_back():
     before, now = first_visit()
     home = HERE.clone()

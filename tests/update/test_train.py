@@ -22,6 +22,7 @@ from refield.update import fit_textured, relight, supervision, train
 from refield.update.config import UpdateConfig
 from refield.update.cut import CutConfig
 from refield.update.fit_helper import HelperConfig, HelperTraining, Lit
+from refield.update.frozen import FreezeConfig
 from refield.update.ground import GroundConfig
 from refield.update.light import Relighting, Sightings
 from refield.update.relight import RelightConfig
@@ -169,7 +170,7 @@ def test_what_judges_is_never_fitted_to(case: tuple[Capture, SceneChange], monke
         monkeypatch.setattr(room, name, lambda *given, **more: (told.append(given[at]), own(*given, **more))[1])
 
     wrapped(relight, "at_most_of", taught, 0)
-    wrapped(fit_textured, "textured_planes", taught, 4)
+    wrapped(fit_textured, "textured_planes", taught, 5)
     wrapped(train, "spared", judged, 1)
     own = train.HelperTraining
 
@@ -199,6 +200,7 @@ def test_every_departure_from_the_paper_can_be_switched_off(
         relight=RelightConfig(still=False, moved=False),
         supervise=SuperviseConfig(exposure=False),
         ground=GroundConfig(footholds=False),
+        freeze=FreezeConfig(unseen=False),
         show=ShowConfig(spared=False),
     )
     off = replace(off, fit=replace(off.fit, directions=True))
@@ -206,6 +208,7 @@ def test_every_departure_from_the_paper_can_be_switched_off(
     assert len(judged) == 1
     assert usual.eyes is not None and plain.eyes is None
     assert usual.shading and plain.shading == () and plain.light is None
+    assert len(usual.unseen) and not len(plain.unseen)
     assert usual.region.planes and not plain.region.planes
     for updated, some in ((usual, False), (plain, True)):
         assert isinstance(updated.helper, HashField)

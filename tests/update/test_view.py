@@ -42,7 +42,9 @@ def once(base: HashField) -> UpdatedField:
     shading = light_on((-0.8, -0.1, 0.0), (-0.2, 0.5, 0.5))
     eyes = torch.tensor([[2.0, 0.0, 1.0], [0.0, 2.0, 1.0], [-2.0, 0.5, 1.0]])
     change = change_of(moved(OLD, NEW_POSE))
-    return UpdatedField(base, change, Learnt(BallWorld(()), light=light, shading=(shading,)), eyes=eyes)
+    field = UpdatedField(base, change, Learnt(BallWorld(()), light=light, shading=(shading,)), eyes=eyes)
+    cells = base.sampler.cells_in(torch.tensor([[0.1, 0.5, 0.0], [0.4, 0.9, 0.6]]))
+    return field.unshown(cells)
 
 
 def assert_alike(field: UpdatedField, seen: Rendering) -> None:
@@ -54,7 +56,7 @@ def assert_alike(field: UpdatedField, seen: Rendering) -> None:
 
 
 def test_a_view_shows_what_the_field_says() -> None:
-    """A move with a helper, light and shading; a second visit on top of it."""
+    """A move with a helper, light, shading and cells that are not shown; a second visit on top of it."""
     base = slab()
     field = once(base)
     seen = render_many(field, views(64))

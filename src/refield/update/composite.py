@@ -8,6 +8,7 @@ cut out: nothing is left inside them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import replace
 
 import torch
@@ -80,8 +81,17 @@ class UpdatedField:
         before = pretrained if isinstance(pretrained, UpdatedField) else None
         cells_before = None if before is None else before._cells
         self._cells: Cells = cells_of(self.routing, earlier.ground, pretrained.sampler, cells_before)
-        self.sampler: OccupancySampler = self._looking() if sampler is None else sampler
-        self._marching: Marching = Marching(self, self._cells, None if before is None else before._marching)
+        none = pretrained.sampler.grid.new_zeros(0, dtype=torch.long)
+        self.unseen: Tensor = none if before is None else before.unseen
+        """flat indices of the sampler's cells that are not shown, see `unshown`"""
+        if sampler is None:
+            sampler = self._without_unseen(pretrained.sampler.refreshed(self.density, self.boxes))
+        self._look_where(sampler)
+
+    def _look_where(self, sampler: OccupancySampler) -> None:
+        self.sampler = sampler
+        before = self.pretrained._marching if isinstance(self.pretrained, UpdatedField) else None
+        self._marching: Marching = Marching(self, self._cells, before)
 
     def _usual_region(self) -> Region:
         rest, step = self.to_learn, self.pretrained.sampler.step
@@ -113,6 +123,14 @@ class UpdatedField:
         """The change without the objects about which an earlier visit knows everything."""
         return _part(self.change, self.skipped | {origin.object for origin in self.earlier.left})
 
+    def unshown(self, cells: Tensor) -> UpdatedField:
+        """The same field, empty in those of its sampler's cells (flat indices) that nothing new answers for; so are the
+        fields that later visits make of it."""
+        out = copy(self)
+        out.unseen = torch.cat([self.unseen, cells]).unique()
+        out._look_where(out._without_unseen(self.sampler))
+        return out
+
     def but(
         self,
         *,
@@ -130,14 +148,13 @@ class UpdatedField:
             eyes=self.eyes,
             earlier=self.earlier if earlier is None else earlier,
             taken=self.taken if taken is None else taken,
-        )
+        ).unshown(self.unseen)
         out.why_stopped = self.why_stopped
         return out
 
-    def _looking(self) -> OccupancySampler:
-        """Where to look: as the field before does, and anew where things changed."""
-        sampler = self.pretrained.sampler.refreshed(self.density, self.boxes)
+    def _without_unseen(self, sampler: OccupancySampler) -> OccupancySampler:
         grid = sampler.grid.clone()
+        grid.view(-1)[self.unseen] *= self._cells.told.view(-1)[self.unseen]
         grid.view(-1)[self._cells.empty] = 0
         return replace(sampler, grid=grid)
 

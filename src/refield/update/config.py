@@ -7,6 +7,7 @@ from typing import Literal
 
 from refield.update.cut import CutConfig
 from refield.update.fit_helper import HelperConfig
+from refield.update.frozen import FreezeConfig
 from refield.update.ground import GroundConfig
 from refield.update.paper.config import PaperUpdateConfig
 from refield.update.relight import RelightConfig
@@ -26,6 +27,8 @@ class UpdateConfig:
     """which pixels teach"""
     ground: GroundConfig = field(default_factory=GroundConfig)
     """what objects stood on"""
+    freeze: FreezeConfig = field(default_factory=FreezeConfig)
+    """what of the old field stays"""
     fit: HelperConfig = field(default_factory=HelperConfig)
     """the helper's training"""
     show: ShowConfig = field(default_factory=ShowConfig)

@@ -25,6 +25,7 @@ from refield.update.ground import Foothold
 from refield.update.helper import HelperOccupancy, emptiness, without_directions
 from refield.update.region import Region
 from refield.update.supervision import Lessons
+from refield.update.unseen import Sight
 
 _RAYS = 1024, 8192  # of a step, at least and at most
 _NEW = 0.5  # of a step's rays from the new photos: they alone show what arrived, and are few beside the old
@@ -97,12 +98,13 @@ class HelperTraining:
         config: HelperConfig,
         draw: torch.Generator,
         ground: Sequence[Foothold] = (),
+        sight: Sight | None = None,
     ) -> None:
         self.helper, self.config, self.frozen, self.draw = helper, config, frozen, draw
         self.taught, self.new, self.judge = taught, new, judge
         added = tuple(o.grid for o in frozen.change.objects if o.kind == "added")
         taken = Region(added + frozen.bare.grids)
-        empty = emptiness(frozen.change, helper.sampler, frozen.pretrained.sampler, taken, ground)
+        empty = emptiness(frozen.change, helper.sampler, taken, ground, sight)
         self.misplaced = config.emptiness * empty
         self.occupancy = HelperOccupancy(helper, draw, (empty == 1) & (config.emptiness > 0))
         self.adam = TableAdam(helper)

@@ -25,6 +25,7 @@ from torch.nn import functional
 
 from refield.field.radiance import Field
 from refield.field.render import CHUNK, render_many, visible_samples
+from refield.field.sampling import OccupancySampler
 from refield.field.volrend import weights
 from refield.field.warp import outline
 from refield.scene.capture import Rays
@@ -54,7 +55,7 @@ _GRAZING = 0.1  # sine of the angle at which a ray is taken to meet a plane at l
 
 
 def textured_of(
-    known: Known, ground: Sequence[Foothold], config: GroundConfig, pixel: float
+    known: Known, ground: Sequence[Foothold], dark: OccupancySampler, config: GroundConfig, pixel: float
 ) -> tuple[TexturedPlane, ...]:
     """The texture of the ground that objects stood on, and of what is beside these places and the new ones, within
     the config's reach; the rest as of `textured_planes`."""
@@ -63,13 +64,14 @@ def textured_of(
     around = Region(tuple(g.dilated(config.reach) for g in places) + cut.earlier.unknown.grids)
     arrived = tuple(g for o in cut.change.objects if (g := o.grid_now) is not None)
     unsure, taught = Region(arrived + cut.bare.grids), known.sparse.taught
-    return textured_planes(ground, around, cut, unsure, taught, pixel, patterned=config.patterned)
+    return textured_planes(ground, around, cut, dark, unsure, taught, pixel, patterned=config.patterned)
 
 
 def textured_planes(
     ground: Sequence[Foothold],
     around: Region,
     cut: UpdatedField,
+    dark: OccupancySampler,
     unsure: Region,
     new: Lessons,
     pixel: float,
@@ -80,6 +82,7 @@ def textured_planes(
 
     Args:
         cut: the field before, without what left and with what moved.
+        dark: looks where no old photo did; what the field before shows there, inside of things, is no ground.
         unsure: where something stands now; what a ray through it shows is not the ground.
         new: pixels of the new photos.
         pixel: side of a new photo's pixel there, world units.
@@ -87,7 +90,7 @@ def textured_planes(
     """
     planes = {id(f.plane): f.plane for f in ground}.values()
     found = [
-        _textured([f for f in ground if f.plane is p], p, place, cut, unsure, new, pixel, patterned)
+        _textured([f for f in ground if f.plane is p], p, place, cut, dark, unsure, new, pixel, patterned)
         for p in planes
         for place in _apart(around)
     ]
@@ -110,6 +113,7 @@ def _textured(
     plane: Plane,
     around: Region,
     cut: UpdatedField,
+    dark: OccupancySampler,
     unsure: Region,
     new: Lessons,
     pixel: float,
@@ -123,6 +127,7 @@ def _textured(
     for foothold in ground:
         under |= foothold.holds(nodes)
     on, guide = _shown(cut.pretrained, blank, nodes)
+    on &= ~dark.occupied(nodes + blank.clear * blank.normal)
     inside, under, beside = (m.reshape(shape) for m in (inside, inside & under, inside & on & ~under))
     new = new[replace(blank, known=inside).hit(new.rays).nonzero()[:, 0]]
     t = blank.met(new.rays)

@@ -26,6 +26,14 @@ from refield.update.ground import Foothold
 
 
 @dataclass(frozen=True)
+class FreezeConfig:
+    """What of the old field is shown, beside and beneath what is learnt."""
+
+    unseen: bool = True
+    """nothing that no old photo saw, and nothing new where old photos looked through; the paper has all of it shown"""
+
+
+@dataclass(frozen=True)
 class Segments:
     """Packed segments of N rays, near to far on each."""
 

@@ -18,6 +18,7 @@ from refield.scene.capture import Frame
 from refield.scene.change import OccupancyGrid, SceneChange
 from refield.update.ground import Foothold, rim
 from refield.update.region import Region, grown
+from refield.update.unseen import Sight
 
 _SHAPE = HashFieldConfig(levels=8, coarsest=16, log2_table=15)  # of a region, a small part of a scene
 _FINE = 1.5  # pixels of the nearest new photo, the side of a finest cell; so many of these along the space at least and
@@ -64,9 +65,9 @@ def step_near(field: Field, point: Tensor) -> float:
 def emptiness(
     change: SceneChange,
     cells: OccupancySampler,
-    before: OccupancySampler,
     taken: Region,
     ground: Sequence[Foothold] = (),
+    sight: Sight | None = None,
 ) -> Tensor:
     """How surely nothing is in each cell, (R**3,) float32: 0 where there may be something, 1 where nothing can be.
 
@@ -74,11 +75,11 @@ def emptiness(
     near its surface may something else begin: the ground under it, the wall behind it. Where that is one of
     ``ground``, it is there, and the more so the nearer to it; what is above it near the object's surface is half as
     empty, since a wall that the object leant on may not be among them; so is what lies above it right beside the
-    object, where the old field shows the object's own skin. Where the old field does not even look, as ``before``
-    says, and nothing left, there is nothing either. 0 in ``taken``, where something stands now.
+    object, where the old field shows the object's own skin. Where old photos looked through (``sight``), nothing is.
+    0 in ``taken``, where something stands now.
     """
     r = cells.resolution
-    depth, stood = torch.zeros(r**3), torch.zeros(r**3, dtype=torch.bool)
+    depth = torch.zeros(r**3)
     cell = 4 * cells.contraction.radius / r
     centres = cells.points_in(torch.arange(r**3), jitter=False)
     left = [o.grid for o in change.objects if o.kind != "added"]
@@ -87,22 +88,25 @@ def emptiness(
         if not len(grid.occupied()):
             continue
         inside = grid.contains(centres)
-        stood |= inside
         if inside.any():  # not of what is thinner than a cell
             distance = distance_transform_edt(inside.reshape(r, r, r).numpy())
             deep = torch.from_numpy(distance).float().reshape(-1) * cell / rim(grid) - 1
             depth = torch.maximum(depth, deep.clamp(0, 1))
         above = [f.plane.height(centres.numpy()) > _band(f, cell) for f in ground if f.grid is grid]
         if above:
-            near = grown(grid, _skin(grid, before)).contains(centres)
+            near = inside if sight is None else grown(grid, _skin(grid, sight.sampler)).contains(centres)
             free = near & torch.from_numpy(np.logical_and.reduce(above))
             depth[free] = depth[free].clamp_min(_RIM)
+    dark = None if sight is None else sight.dark.occupied(centres)
     for foothold in ground:
         height, band = torch.from_numpy(foothold.plane.height(centres.numpy())), _band(foothold, cell)
         off = ((height.abs() - 2 * foothold.plane.noise) / band).clamp(0, 1)
-        here = (height.abs() < band) & foothold.holds(centres)
+        here = (height < band) & foothold.holds(centres)
+        if dark is not None:  # a table's legs are no mist
+            here &= (height > -band) | dark
         depth[here] = torch.maximum(depth[here], _RIM * off[here])
-    depth[~(before.occupied(centres) | stood)] = 1.0
+    if sight is not None:
+        depth[~sight.possible.occupied(centres)] = 1.0
     return torch.where(taken.contains(centres), 0.0, depth) if taken.grids else depth
 
 

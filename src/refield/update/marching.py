@@ -67,9 +67,21 @@ class Marching:
             known = self.base.samples(
                 rays, jitter, without=replace(self.field.sampler, grid=self.cells.retold, fine=None).occupied
             )
+            mid, d = known.positions(rays)
+            start = mid - d * ((known.t_ends - known.t_starts) / 2)[:, None]
+            # an interval that begins where a surface was seen may reach beneath it
+            unshown = self._unshown
+            known = known.only(~(unshown.occupied(mid) & unshown.occupied(start)))
         else:
             known = self.split[0].visible(rays, self.base.density_net, jitter)
         return interleaved(known, self._told_samples(rays, jitter))
+
+    @property
+    def _unshown(self) -> OccupancySampler:
+        """Looks into the cells alone that are not shown."""
+        grid = torch.zeros_like(self.field.sampler.grid)
+        grid.view(-1)[self.field.unseen] = 1 - self.cells.told.view(-1)[self.field.unseen]
+        return replace(self.field.sampler, grid=grid, fine=None)
 
     @property
     def rendered(self) -> Callable[[Rays, int], Rendering] | None:
@@ -108,6 +120,9 @@ class Marching:
         if field.light is not None:
             grid |= field.light.cells(sampler)
             boxes.append(field.light.aabb)
+        if len(field.unseen):
+            x = sampler.points_in(field.unseen, jitter=False)
+            boxes.append(torch.stack([x.amin(0), x.amax(0)]))
         return finer(replace(sampler, grid=grid, fine=None)), tuple(_by_cells(sampler, b) for b in boxes)
 
     @cached_property

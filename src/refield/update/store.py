@@ -50,6 +50,7 @@ def save_updated(folder: Path, field: UpdatedField | PaperField) -> None:
         facts[name] = len(known.grids)
     facts["undone"] = [[o.object, o.layer, o.index] for o in field.earlier.undone]
     facts["left"] = [[o.object, o.layer, o.index] for o in field.earlier.left]
+    tensors["unseen"] = field.unseen
     if field.eyes is not None:
         tensors["eyes"] = field.eyes
     facts["shading"] = len(field.shading)
@@ -86,6 +87,9 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
         shading = tuple(_light_in(f"shading.{i}", tensors) for i in range(facts["shading"]))
         own = {name.removeprefix("helper."): t for name, t in tensors.items() if name.startswith("helper.")}
         helper = HashField.from_state(own, facts["helper"]) if facts["helper"] is not None else None
+        unseen = tensors.get("unseen", torch.zeros(0, dtype=torch.long))  # of older visits it is not known
+        if unseen.dtype != torch.long or not bool(((unseen >= 0) & (unseen < pretrained.sampler.grid.numel())).all()):
+            raise ValueError("a cell that is not shown is not one of the grid's")
         grid, fine = occupancy_in(tensors)
         sampler = replace(pretrained.sampler, grid=grid, fine=fine)
         base, earlier = _earlier_in(tensors, facts, pretrained)
@@ -93,7 +97,7 @@ def load_updated(folder: Path, pretrained: Field, change: SceneChange) -> Update
         raise InputError(folder, f"does not describe an updated field ({error})", _REMEDY) from None
     learnt = Learnt(helper, region, light, shading, bare)
     eyes = tensors.get("eyes")
-    return UpdatedField(base, change, learnt, eyes=eyes, earlier=earlier, sampler=sampler)
+    return UpdatedField(base, change, learnt, eyes=eyes, earlier=earlier, sampler=sampler).unshown(unseen)
 
 
 def _earlier_in(tensors: dict[str, Tensor], facts: dict[str, Any], field: Field) -> tuple[Field, Earlier]:

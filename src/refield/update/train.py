@@ -28,6 +28,7 @@ from refield.update.region import Region, finer, meets, move_out, without_planes
 from refield.update.relight import light_of, shading_of
 from refield.update.spared import spared
 from refield.update.supervision import at_most_of, old_lessons, places_of
+from refield.update.unseen import nothing_seen, sight_of
 
 DEFAULTS = UpdateConfig()
 _NEW_RAYS = 1 << 18  # of the new photos, through the region; about as many as training draws
@@ -88,21 +89,25 @@ def update_field(
         return done(cut.but(learnt=lit), "no photo shows any of it, so that nothing could be learnt")
     seen_from = centres(capture.train).float()
     ground = ground_of(known, old, wide, seen_from, max(pixel, step), draw) if config.ground.footholds else []
+    sight = (
+        sight_of(cut.pretrained, capture.train, wide.around) if config.freeze.unseen else nothing_seen(cut.pretrained)
+    )
     textured = ground if config.ground.textured else []
-    planes = textured_of(known, textured, config.ground, pixel)
+    planes = textured_of(known, textured, sight.dark, config.ground, pixel)
     say("freeze")
     told, region = Region(wide.grids, planes), finer(without_planes(near, planes))
-    frozen = cut.but(learnt=replace(lit, region=told))
+    frozen = cut.but(learnt=replace(lit, region=told)).unshown(sight.hidden)
     if not region.grid.any():
         return done(frozen, "there is nothing but the ground to show")
     teaching, judging = (Lit(some, fixed_along(frozen, region, some.rays, ground)) for some in (taught, sparse.judging))
     say("train")
     helper = new_helper(region, change.frames, config.seed, directions=config.fit.directions)
-    run = HelperTraining(helper, frozen, teaching, len(sparse.taught), judging, config.fit, draw, ground)
+    run = HelperTraining(helper, frozen, teaching, len(sparse.taught), judging, config.fit, draw, ground, sight)
     run.run(on_progress)
     say("show")
     helper.requires_grad_(False)
-    return done(cut.but(learnt=replace(lit, helper=helper, region=told)), run.why_stopped)
+    updated = cut.but(learnt=replace(lit, helper=helper, region=told)).unshown(sight.hidden)
+    return done(updated, run.why_stopped)
 
 
 def _done(updated: UpdatedField, why_stopped: str, *, known: Known, config: UpdateConfig) -> UpdatedField:
