@@ -112,6 +112,14 @@ def test_an_added_box_is_found(old, tmp_path):
     assert overlap(new.grid, guest)[1] > 0.4
 
 
+def test_what_arrived_in_the_only_photo_is_told_with_doubt(old, tmp_path):
+    photos = new_photos(BoxWorld((CRATE, DRUM, standing((0.16, 0.16, 0.16), 0.1, -0.45, 35, paint=9))), tmp_path)
+    by_all, by_one = (estimate_change(old, BEFORE, some, EstimateConfig(survey=6)) for some in (photos, photos[:1]))
+    assert [o.kind for o in by_one.objects] == [o.kind for o in by_all.objects] == ["added"]
+    assert by_one.objects[0].confidence < 0.25 < 0.5 < by_all.objects[0].confidence
+    assert "one photo does not tell" in by_one.why and "one photo" not in by_all.why
+
+
 def test_what_left_where_another_came_is_told_with_doubt(old, tmp_path):
     guest = standing((0.16, 0.16, 0.16), 0.1, -0.55, 35, paint=9)
     change = estimate(old, BoxWorld((DRUM, guest)), tmp_path)

@@ -31,6 +31,7 @@ from refield.vision import pixels
 _NOTABLE = 0.002  # of a photo's pixels; smaller spots that nothing explains are not spoken of
 _MUCH = 0.25  # of the changed pixels; less that nothing explains is the ragged edge of what something does
 _LARGE = 0.02  # of a photo's pixels
+_BY_ONE = "; one photo does not tell how far away it is, or whether it stood where that does not look"
 _MASK_RAYS = 300_000  # for the outlines of one object in all new photos; larger photos' masks are scaled up
 
 
@@ -57,10 +58,12 @@ def concluded(scene: Told, settled: Settled) -> SceneChange:
         note += "; or it moved, and shows a side that no old photo saw" if settled.arrived else ""
         masks, sure = _masks_of(frames, olds[k]), confidence("removed", settled.led[k], bool(settled.arrived))
         changes.append(ObjectChange("removed", olds[k].shape, masks=masks, confidence=sure, note=note))
+    once = len(settled.views) == 1
     for body, lead in zip(settled.arrived, settled.came):
         grid, share = _newcomer(body), fresh(settled.views, body)
         note = f"it hides what was there in {100 * share:.0f} % of its pixels, and nothing that left looks like it"
-        masks, sure = segment.masks_in(frames, grid), confidence("added", lead, bool(settled.removed))
+        note += _BY_ONE if once else ""
+        masks, sure = segment.masks_in(frames, grid), confidence("added", lead, bool(settled.removed) or once)
         changes.append(ObjectChange("added", grid, masks_in=masks, confidence=sure, note=note))
     left = _unexplained(scene, settled)
     reasons = [f"1 {c.kind}{_by(c)}: {c.note}" for c in changes]

@@ -15,15 +15,17 @@ _MOST = 0.93
 _EVEN: dict[Kind, tuple[float, float]] = {"moved": (0.13, 0.05), "removed": (0.5, 0.06), "added": (0.1, 0.05)}
 """the lead with which as many are right as wrong, and how much more makes it e times as many"""
 _ONE_OF_TWO = 0.2
-"""of what left where something arrived, and of what arrived where something left: most are one thing that moved"""
+"""of what left where something arrived, of what arrived where something left, and of what arrived by the only photo
+there is: most are one thing that moved"""
 
 
-def confidence(kind: Kind, lead: float, opposite: bool) -> float:
+def confidence(kind: Kind, lead: float, half: bool) -> float:
     """How likely an object's kind, and its place within 2 % of the distance to the cameras, is right, 0 to 1.
 
     Args:
         lead: pixels that the best other answer does not explain and this one does, as a part of those concerned.
-        opposite: whether something arrived, for what left; whether something left, for what arrived.
+        half: whether it may be one half of a move: something arrived, for what left; something left, for what arrived,
+            or there is one photo alone, which does not say how far away it is, nor what left where it does not look.
     """
     even, scale = _EVEN[kind]
-    return _MOST * float(expit((lead - even) / scale)) * (_ONE_OF_TWO if opposite else 1.0)
+    return _MOST * float(expit((lead - even) / scale)) * (_ONE_OF_TWO if half else 1.0)
