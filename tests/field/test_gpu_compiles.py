@@ -36,7 +36,7 @@ def compiled(levels: int, width: int) -> None:
         source = ASTSource(fn=kernel, signature=signature, constexprs=asked)
         done = triton.compile(source, target=GPUTarget("cuda", 90, 32), options=how)
         assert done.metadata.shared <= 227 << 10, kernel  # bytes that a program may have
-        # more warps than 16 rows of a product each would all write what is one's: wrong colours, on a GPU alone
+        # with 8 warps for blocks of 64 rows, products that follow on each other came out wrong on an H100, unsteadily
         assert asked["BLOCK"] >= 16 * how["num_warps"], kernel
 
 
@@ -51,6 +51,7 @@ def test_kernels_compile_for_a_gpu(shape: tuple[int, int], tmp_path: Path) -> No
         env=environment,
         cwd=Path(__file__).parents[2],
         capture_output=True,
+        timeout=300,
         text=True,
     )
     assert run.returncode == 0, run.stderr[-3000:]

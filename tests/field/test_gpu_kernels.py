@@ -45,6 +45,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:TRITON_DEFAULT_FP_FUSION is unse
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 LAYOUTS = [(4,), (16, 37, 512), geometric_levels(16, 1024, 10)]
 SHAPES = [(LAYOUTS[0], 8, 3), (LAYOUTS[1], 20, 15), (LAYOUTS[2], 32, 15)]  # levels, width, geometry features
+WIDE = (geometric_levels(16, 2048, 13), 64, 15)  # as large fields have it
 
 
 @pytest.fixture(autouse=True)
@@ -85,12 +86,13 @@ def both(function, inputs: list[Tensor], *rest: object) -> list[tuple[Tensor, Te
 
 
 def assert_equal(pairs: list[tuple[Tensor, Tensor]], rtol: float = 1e-4, share: float = 2e-3) -> None:
-    """Equal up to rtol and a share of the mean magnitude of what is not zero.
+    """Equal up to rtol and a share of the mean magnitude; on a GPU, of what is not zero.
 
-    A GPU multiplies and subtracts in one step: where in a fine cell a place lies is 1e-5 more exact there.
+    There a product and a sum are rounded once: where in a fine cell a place lies is 1e-5 more exact.
     """
     for truth, fast in pairs:
-        atol = share * float(truth[truth != 0].abs().mean().nan_to_num()) + 1e-6
+        counted = truth[truth != 0] if ON_GPU else truth
+        atol = share * float(counted.abs().mean().nan_to_num()) + 1e-6
         torch.testing.assert_close(fast, truth, rtol=rtol, atol=atol)
 
 
@@ -121,11 +123,13 @@ def field_parts(shape: tuple[tuple[int, ...], int, int], samples: int = 333) -> 
     return [torch.rand(samples, 3), unit_vectors(samples), torch.randn(levels, 1 << 12, 2), *networks]
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", [*SHAPES, WIDE])
 @pytest.mark.parametrize("precision", ["tf32x3", "tf32", "bf16"])
 def test_fused_field(shape: tuple[tuple[int, ...], int, int], precision: str) -> None:
     if precision == "bf16" and not ON_GPU:
         pytest.skip("the interpreter takes the bits of bf16 for integers")
+    if shape is WIDE and precision == "tf32x3":
+        pytest.skip("the gradients' three products do not fit on a chip")
     torch.manual_seed(2)
     unit, d, *parts = field_parts(shape)
     # factors of 11 bits put one hidden unit in a thousand on the other side of zero: 0.03 of a gradient's norm, seen

@@ -31,7 +31,7 @@ from refield.vision import pixels
 _NOTABLE = 0.002  # of a photo's pixels; smaller spots that nothing explains are not spoken of
 _MUCH = 0.25  # of the changed pixels; less that nothing explains is the ragged edge of what something does
 _LARGE = 0.02  # of a photo's pixels
-_BY_ONE = "; one photo does not tell how far away it is, or whether it stood where that does not look"
+_BY_ONE = "; one photo does not tell how far away it is, nor whether it came from where that photo does not look"
 _MASK_RAYS = 300_000  # for the outlines of one object in all new photos; larger photos' masks are scaled up
 
 

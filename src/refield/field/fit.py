@@ -38,7 +38,7 @@ class FitConfig:
     photo_memory: float | None = None
     """GB for the photos' pixels. Of more than fit, a part is kept, drawn from every photo alike"""
     device: Literal["cpu", "cuda"] = field(default="cpu", metadata={"usual": True})
-    """where the fit runs. The field comes back to the CPU. The CUDA path was tested in an interpreter, not on a GPU"""
+    """where the fit runs. The field comes back to the CPU"""
     samples: int = 8192
     """a step; the rays follow from how many samples each needs, and behind the first surface it needs none"""
     samples_per_ray: float = 40

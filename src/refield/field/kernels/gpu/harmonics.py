@@ -10,8 +10,8 @@ import triton.language as tl
 def harmonics(x, y, z):  # type: ignore[no-untyped-def]
     """`reference.spherical_harmonics` of directions (B,) x 3 -> (B, 16).
 
-    Column by column into its place: joined and reshaped columns are a shape that Triton 3.6 cannot hand to a product of
-    matrices on Hopper.
+    Column by column into its place: sixteen that are joined in four steps are a shape that Triton 3.6 cannot hand to a
+    product of matrices on Hopper.
     """
     xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
     column = tl.arange(0, 16)[None, :]

@@ -30,7 +30,7 @@ from refield.field.kernels.reference import DensityNet, Networks
 Precision = Literal["tf32", "tf32x3", "ieee", "bf16"]
 """of the factors in the networks' products; sums are float32. fp16 is left out: the gradients of a mean underflow it"""
 
-_FORWARD = {"BLOCK": 64, "num_warps": 4}  # more than a warp for 16 rows of a product is wrong on Hopper
+_FORWARD = {"BLOCK": 64, "num_warps": 4}  # with 8 warps for 64 rows, colours are wrong on Hopper
 _BACKWARD = {"BLOCK": 64, "num_warps": 4, "num_stages": 1}
 _PROGRAMS_PER_SM = 2  # of the backward pass; as many as its registers let live at once
 
