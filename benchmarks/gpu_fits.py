@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -18,13 +17,15 @@ from refield.field.coverage import beside, knowable
 from refield.field.fit import FitConfig, FitProgress
 from refield.field.fit_nerfacto import NerfactoFitConfig
 from refield.field.gpu_fit import move
+from refield.field.graphed import DevicePixels
 from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
+from refield.field.photo_model import PhotoModel
 from refield.field.photos import Photos
 from refield.field.placing import finest_for, place_contraction
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import CHUNK, render_camera, render_many, visible_samples
 from refield.field.sampling import OccupancySampler
-from refield.scene.capture import Capture, Frame, Rays, camera_rays
+from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.images import frame_image
 
 LEVELS = (25, 28, 30, 32)  # dB, times to which are told
@@ -169,13 +170,12 @@ def nerfacto(report: Report, capture: Capture, config: NerfactoFitConfig, device
     with report.trial("the NeRFacto shape is not on a GPU yet"):
         sampler = looking_everywhere(place_contraction(capture), config.field)
         model = NerfactoField(config.field, sampler, config.seed)
-        fitting: Any = fit_nerfacto._NerfactoFit(model, capture, config, looks.append)
+        fitting = fit_nerfacto._NerfactoFit(model, Photos.of(capture), config, looks.append)
         move(model, device)  # type: ignore[arg-type]
-        fitting.photos.bank = graphed.DevicePixels(fitting.photos.bank, device)
-        if fitting.judge.rays is not None:
-            rays = fitting.judge.rays
-            fitting.judge.rays = Rays(rays.origins.to(device), rays.directions.to(device))
-            fitting.judge.truth = fitting.judge.truth.to(device)
+        bank = DevicePixels(fitting.photos.bank, device)  # type: ignore[arg-type]
+        with torch.device(device):
+            fitting.photos = PhotoModel(bank, model.sampler, config.photos)
+        fitting.judge.move(device)
         fitting.adam = torch.optim.Adam(model.parameters(), lr=config.rate, eps=1e-15, fused=True)
         fitting.began = time.perf_counter()
         with torch.device(device):

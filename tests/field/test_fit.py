@@ -412,7 +412,7 @@ def test_what_compiles_before_the_first_step_takes_no_time_from_the_fit(
 
     later = [0.0]
 
-    def compiles(capture: Capture) -> Contraction:
+    def compiles(capture: Capture, config: FitConfig) -> Contraction:
         with event.trigger_event("numba:compile"):
             later[0] += 1e6
         return place_contraction(capture)

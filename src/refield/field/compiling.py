@@ -25,6 +25,10 @@ class Compiling(event.Listener):
         """Seconds since this listens, without those."""
         return time.perf_counter() - self._began - self.seconds
 
+    def compiled(self, seconds: float) -> None:
+        """Another compiler took so long."""
+        self.seconds += seconds
+
     def on_start(self, event: Any) -> None:
         if self._depth == 0:
             self._since = time.perf_counter()

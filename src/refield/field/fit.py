@@ -174,7 +174,7 @@ def fit_capture(
     capture, since = as_read(capture, since, config.size)
     with compiling() as clock:
         photos = Photos.of(capture, since, most_pixels(config))
-        core = _core(capture) if start is None and config.look_around else None
+        core = _core(capture, config) if start is None and config.look_around else None
         left_out: list[float] = []  # of each fit that was given up
         for attempt in range(_TRIES):
             # the last one is the best of those before, to its end
@@ -183,7 +183,7 @@ def fit_capture(
             model = new_field(capture, config, seed, core) if start is None else opened(start)
             try:
                 if config.device == "cuda":
-                    found = _fit_on_gpu(model, capture, photos, config, on_progress, on_step)
+                    found = _fit_on_gpu(model, capture, photos, config, (on_progress, on_step), clock)
                 else:
                     may_give_up = start is None and attempt < _TRIES - 1
                     run = _Fit(model, photos, config, on_progress, on_step, clock, goes_on=goes_on)
@@ -204,15 +204,23 @@ _FIRST_LOOK = FitConfig(steps=150, samples=4096, check_every=1000, field=HashFie
 _LOOKED_AT = 1e6  # pixels
 
 
-def _core(capture: Capture) -> Contraction:
+def _core(capture: Capture, config: FitConfig) -> Contraction:
     """Where the core goes, going by a first look at the photos, or, where that leads nowhere, by the cameras alone."""
     core, frames = place_contraction(capture), capture.train
     pixels = sum(f.camera.width * f.camera.height for f in frames)
-    size = PhotoSizeConfig(min((_LOOKED_AT / pixels) ** 0.5, 1.0))
+    look = replace(_FIRST_LOOK, size=PhotoSizeConfig(min((_LOOKED_AT / pixels) ** 0.5, 1.0)), device=config.device)
+    on_gpu = config.device == "cuda"
+    if on_gpu:  # of the shape that kernels are compiled for anyway
+        look = replace(look, field=replace(config.field, log2_table=look.field.log2_table))
     try:
-        return around(core, fit_field(Capture(frames, capture.points, 0), replace(_FIRST_LOOK, size=size)), frames)
+        first = fit_field(Capture(frames, capture.points, 0), look)
     except NonFiniteError:
         return core
+    if on_gpu:
+        from refield.field.gpu_fit import move
+
+        move(first, torch.device("cuda"))
+    return around(core, first, frames)
 
 
 def _fit_on_gpu(
@@ -220,15 +228,15 @@ def _fit_on_gpu(
     capture: Capture,
     photos: Photos,
     config: FitConfig,
-    on_progress: ProgressCallback | None,
-    on_step: StepCallback | None,
+    told: tuple[ProgressCallback | None, StepCallback | None],
+    clock: Compiling,
 ) -> Capture:
     need_device(config.device)
     if not config.directions or photos.since.share is not None:
         raise InputError("device cuda", "draws all pixels alike, in colours that depend on the direction", "fit on cpu")
     from refield.field.gpu_fit import fit_on_gpu
 
-    return fit_on_gpu(model, capture, photos, config, on_progress, on_step)
+    return fit_on_gpu(model, capture, photos, config, *told, clock)
 
 
 def need_device(device: str) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import torch
 
+from refield.field.compiling import Compiling
 from refield.field.coverage import beside
 from refield.field.descent import FADE_EVERY, MOST_SKIPPED, NonFiniteError, fading
 from refield.field.encoding import Contraction
@@ -43,11 +46,13 @@ def fit_on_gpu(
     config: FitConfig,
     on_progress: ProgressCallback | None = None,
     on_step: StepCallback | None = None,
+    clock: Compiling | None = None,
 ) -> Capture:
     """Fit a field to photos on the current CUDA device; the model comes back to where it was. Returns the capture with
     what the fit found out about its photos.
 
-    As many steps as on a CPU, each of 32 times the samples. ``on_step`` hears every 16th.
+    As many steps as on a CPU, each of 32 times the samples. ``on_step`` hears every 16th. ``clock``: of the fit, which
+    may have begun before this.
 
     Raises:
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row.
@@ -56,13 +61,34 @@ def fit_on_gpu(
     known = photos.knowable(model.sampler).to(device), beside(model.sampler, photos.train).to(device)
     outside = stand_outside(model.contraction, photos.train)
     move(model, device)
+    clock = clock or Compiling()
     try:
-        with torch.device(device):  # what is made in here without a device named is made on the GPU
-            fit = _GpuFit(model, photos, config, (known, outside), (on_progress, on_step))
+        # what is made in here without a device named is made on the GPU
+        with torch.device(device), _hearing_triton(clock):
+            fit = _GpuFit(model, photos, config, (known, outside), (on_progress, on_step), clock)
             fit.run()
             return fit.photos.told(capture, fit.judge, model)
     finally:
         move(model, home)
+
+
+@contextmanager
+def _hearing_triton(clock: Compiling) -> Iterator[None]:
+    """Let the clock know while Triton compiles, and whoever else listens."""
+    from triton import knobs
+
+    before = knobs.compilation.listener
+
+    def hear(*, times: Any, **what: Any) -> None:
+        clock.compiled(times.total / 1e6)
+        if before is not None:
+            before(times=times, **what)
+
+    knobs.compilation.listener = hear
+    try:
+        yield
+    finally:
+        knobs.compilation.listener = before
 
 
 def move(model: HashField, device: torch.device) -> None:
@@ -84,6 +110,7 @@ class _GpuFit:
         config: FitConfig,
         places: tuple[tuple[torch.Tensor, torch.Tensor], bool],
         told: tuple[ProgressCallback | None, StepCallback | None],
+        clock: Compiling | None = None,
     ) -> None:
         """``places``: cells that are `Photos.knowable`, and those `beside` cameras; whether these `stand_outside`."""
         (allowed, near), outside = places
@@ -103,7 +130,7 @@ class _GpuFit:
         self.capacity = config.samples * _BATCH
         self.rays_per_step, self.coarseness = _SIZES[0], COARSEST
         self.finest_step = model.sampler.step
-        self.began, self.rays_done, self.step = time.perf_counter(), 0, 0
+        self.clock, self.rays_done, self.step = clock or Compiling(), 0, 0
 
     def run(self) -> None:
         self.model.train()
@@ -172,7 +199,7 @@ class _GpuFit:
         return graph, step + graph.capture()
 
     def _progress(self, step: int) -> float:
-        return progress_of(self.config, step, time.perf_counter() - self.began)
+        return progress_of(self.config, step, self.clock.worked)
 
     def _expose(self, step: int) -> float:
         """How far the fit is; and find out, when that is due, whether photos are exposed alike."""
@@ -215,8 +242,8 @@ class _GpuFit:
         psnr = self.judge.psnr(self.model, self.photos.exposing)
         self.model.train()
         if self.on_progress:
-            seconds = time.perf_counter() - self.began
-            left = seconds_left(self.config, step, seconds)
+            worked = self.clock.worked
+            left, seconds = seconds_left(self.config, step, worked), worked + self.clock.seconds
             speed = self.rays_done / seconds
             self.on_progress(FitProgress(step, self.config.steps, psnr, speed, samples_per_ray, seconds, left))
         return psnr

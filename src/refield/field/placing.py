@@ -94,11 +94,14 @@ def around(core: Contraction, first: Field, frames: Sequence[Frame]) -> Contract
         for f, size in zip(frames, sizes)
     ]
     rays = Rays(torch.cat([r.origins for r in lines]), torch.cat([r.directions for r in lines]))
-    shown = render_many(first, rays)
-    solid = (shown.opacity > 0.5) & shown.depth.isfinite()
+    device = first.sampler.grid.device
+    with device:
+        shown = render_many(first, Rays(rays.origins.to(device), rays.directions.to(device)))
+    opacity, depth = shown.opacity.cpu(), shown.depth.cpu()
+    solid = (opacity > 0.5) & depth.isfinite()
     if not solid.any():
         return core
-    reach = core.reach(rays.origins[solid] + rays.directions[solid] * shown.depth[solid, None])
+    reach = core.reach(rays.origins[solid] + rays.directions[solid] * depth[solid, None])
     return replace(core, radius=core.radius * min(max(float(reach.quantile(_HELD)), 1.0), _LARGEST))
 
 

@@ -20,7 +20,7 @@ from refield.field.kernels.gpu.networks import density_shape, matrix, raw_densit
 from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 
 _RAYS = {"BLOCK": 32, "num_warps": 1}
-_SEEING = {"BLOCK": 32, "num_warps": 2}  # with one, the features of 32 places spill out of the registers
+_SEEING = {"BLOCK": 16, "num_warps": 1}  # more warps wait for the longest of more rays; more places a warp spill
 
 
 @triton.jit

@@ -272,3 +272,26 @@ class _Distortion(Function):
 def distortion(w: Tensor, s_starts: Tensor, s_ends: Tensor, offsets: Tensor) -> Tensor:
     """See `reference.distortion`; gradients flow to the weights only."""
     return _Distortion.apply(w, s_starts, s_ends, offsets)
+
+
+@triton.jit
+def _heaviest(w, offsets, out, CHUNK: tl.constexpr):  # type: ignore[no-untyped-def]
+    ray = tl.program_id(0)
+    begin, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
+    most = -1.0
+    at = begin * 0 - 1
+    for first in range(begin, end, CHUNK):
+        i = first + tl.arange(0, CHUNK)
+        each = tl.load(w + i, mask=i < end, other=-1.0)
+        here = tl.max(each, 0)
+        at = tl.where(here > most, tl.min(tl.where(each == here, i, end), 0), at)
+        most = tl.maximum(most, here)
+    tl.store(out + ray, at)
+
+
+def heaviest(w: Tensor, offsets: Tensor) -> Tensor:
+    """See `reference.heaviest`."""
+    rays = len(offsets) - 1
+    out = torch.empty(rays, dtype=torch.int64, device=w.device)
+    _heaviest[(rays,)](w.contiguous(), offsets, out, **_RAY)
+    return out

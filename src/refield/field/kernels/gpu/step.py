@@ -7,7 +7,7 @@ from torch import Tensor
 
 from refield.field.kernels.gpu.marching import march_visible
 from refield.field.kernels.gpu.networks import hash_field
-from refield.field.kernels.gpu.rays import accumulate, contract, distortion, ray_ids, weights
+from refield.field.kernels.gpu.rays import accumulate, contract, distortion, heaviest, ray_ids, weights
 from refield.field.kernels.reference import (
     Aim,
     Batch,
@@ -69,18 +69,8 @@ def train_step(
     w, sigmas, loss = w.detach(), sigmas.detach(), loss.detach()
     to_rays = (grads[-2][: batch.moving], grads[-1][: batch.moving]) if batch.moving else None
     real = torch.arange(len(w), device=w.device) < offsets[-1]
-    told = None, shown[:, :3].detach(), errors.detach(), heaviest(w, ids, real, whole > 0), to_rays
+    told = None, shown[:, :3].detach(), errors.detach(), torch.where(whole > 0, heaviest(w, offsets), -1), to_rays
     if capacity is None:
         return Stepped(float(loss), cells, w, sigmas, len(offsets) - 1, *told)
     w, sigmas = torch.where(real, w, -1.0), torch.where(real, sigmas, -1.0)
     return Stepped(loss, cells, w, sigmas, len(offsets) - 1, *told)  # type: ignore[arg-type]
-
-
-def heaviest(w: Tensor, ids: Tensor, real: Tensor, whole: Tensor) -> Tensor:
-    """See `reference.heaviest`: of weights (S,) of rays ``ids`` (S,), those that are ``real``; of rays that are not
-    ``whole`` (N,), for want of room, none."""
-    none = len(w)
-    most = w.new_zeros(len(whole)).scatter_reduce_(0, ids, torch.where(real, w, 0.0), "amax")
-    rows = torch.where(real & (w == most[ids]), torch.arange(none, device=w.device), none)
-    first = torch.full_like(whole, none, dtype=torch.long).scatter_reduce_(0, ids, rows, "amin")
-    return torch.where(whole & (first < none), first, -1)
