@@ -91,13 +91,23 @@ def _see_all(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
 
 
 def _see(field: Field, rays: Rays, hidden: Hidden | None) -> Seen:
+    samples, sigmas = _reaching(field, rays, hidden)
+    return shaded(field, samples.positions(rays), sigmas, samples)
+
+
+def surfaces(field: Field, rays: Rays) -> Tensor:
+    """The median depth of rays alone, (N,); as `see` finds it."""
+    with torch.no_grad():
+        parts = [rays[i : i + CHUNK] for i in range(0, max(len(rays), 1), CHUNK)]
+        return torch.cat([median_depth(sigmas, samples) for samples, sigmas in (_reaching(field, p) for p in parts)])
+
+
+def _reaching(field: Field, rays: Rays, hidden: Hidden | None = None) -> tuple[Samples, Tensor]:
+    """Samples that light reaches, without those that are ``hidden``, and their densities (S,)."""
     if hidden is None and not hasattr(field, "samples_within"):
         samples = visible_samples(field, rays)
-        at = samples.positions(rays)
-        return shaded(field, at, field.density(at[0]), samples)
-
-    samples, sigmas = reached(field, field.sampler, rays, () if hidden is None else hidden.grids, inside=False)
-    return shaded(field, samples.positions(rays), sigmas, samples)
+        return samples, field.density(samples.positions(rays)[0])
+    return reached(field, field.sampler, rays, () if hidden is None else hidden.grids, inside=False)
 
 
 def reached(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refield.estimate.carve_kernels import Window, count_on_surface, packed
-from refield.estimate.look import Array, View, see, spread_out
+from refield.estimate.look import Array, View, spread_out, surfaces
 from refield.field.radiance import Field
 from refield.scene.capture import Frame, camera_rays
 from refield.vision import pixels
@@ -45,7 +45,7 @@ class Memory:
         windows, slack = [], []
         for frame in frames:
             camera = frame.camera.within(_RAYS // len(frames))
-            depth = see(field, camera_rays(camera, frame.world_from_cam)).depth.reshape(camera.height, camera.width)
+            depth = surfaces(field, camera_rays(camera, frame.world_from_cam)).reshape(camera.height, camera.width)
             windows.append(Window(camera, frame.world_from_cam, depth.numpy()))
             slack.append(_SLACK / min(camera.fx, camera.fy))
         lenses, depths = packed(windows)
