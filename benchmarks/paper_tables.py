@@ -38,8 +38,7 @@ from refield.vision.perceptual import open_lpips
 from refield.vision.weights import WeightsError
 
 ROOT = Path(__file__).resolve().parents[1]
-COUNTED = ("cube", "cone")  # worlds of Table 7 and Figs. 17 and 18
-PLACED = ("cube",)  # of Table 8
+COUNTED = ("cube", "cone")  # worlds of Figs. 17 and 18
 SECTIONS: dict[str, tuple[str, ...]] = {
     "table3": ("estimate", "old", "ours", "retrained", "finetuned", "inpainted", "inpainted_photo"),
     "longer": ("estimate", "ours", "retrained", "retrained_long"),
@@ -51,7 +50,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
 }
 """what each needs; Tables 1 and 4, Fig. 15 and the sheet come with ``table3``, what is derived with ``longer``"""
 _KNOWN = ("table6", "table7", "table8", "fig17")  # need a world whose change is known
-_ONE_SEED = ("longer", "table7", "table8", "fig17")
+_ONE_SEED = ("longer", "fig17")
 _BEGIN, _END = "<!-- paper tables: begin -->", "<!-- paper tables: end -->"
 
 
@@ -73,7 +72,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
     parser.add_argument("--worlds", nargs="+", choices=sorted(WORLDS), default=list(PAPER))
     parser.add_argument("--folders", nargs="+", type=Path, default=[], help="each with work/, after/ and eval/")
-    parser.add_argument("--seeds", type=int, default=3, help="of each world; longer, tables 7, 8 and fig17: the first")
+    parser.add_argument("--seeds", type=int, default=3, help="of each world; longer and fig17: the first")
     parser.add_argument("--size", type=int, default=256, help="pixels a side")
     parser.add_argument("--cameras", type=int, default=70, help="old photos of a world")
     parser.add_argument("--work", type=Path, default=Path("build/estimate-work"), help="worlds' photos and fields")
@@ -144,9 +143,7 @@ def _wanted(section: str, case: Case) -> bool:
         return False
     if section in _ONE_SEED and case.seed > 0:
         return False
-    if section == "table8":
-        return case.name in PLACED
-    return case.name in COUNTED if section in ("table7", "fig17") else True
+    return section != "fig17" or case.name in COUNTED
 
 
 # --- into the document ---

@@ -33,6 +33,16 @@ def test_a_link_that_leads_out_is_not_followed(tmp_path):
     assert [s.name for s in find_sources(tmp_path / "photos")] == ["a.png"]
 
 
+def test_a_folder_of_links_that_lead_out_is_told_as_such(tmp_path):
+    touch(tmp_path / "disk", "photo.png")
+    touch(tmp_path / "photos", "notes.txt")
+    (tmp_path / "photos" / "photo.png").symlink_to(tmp_path / "disk" / "photo.png")
+    with pytest.raises(
+        InputError, match=r"links that lead out of it \(photo.png\), which are not followed; give the f"
+    ):
+        find_sources(tmp_path / "photos")
+
+
 @pytest.mark.parametrize(
     ("names", "says"),
     [

@@ -42,6 +42,12 @@ def find_sources(folder: Path) -> tuple[Source, ...]:
         if below:
             what = f"holds no photos itself, but folders of photos ({named(below)})"
             raise InputError(folder, what, "give one of them: each visit's photos are a folder of their own")
+        out = sorted(
+            p.name for place in _places(folder) for p in place.iterdir() if p.is_file() and _leads_out(folder, p)
+        )
+        if out:
+            what = f"holds no photos, but links that lead out of it ({named(out)}), which are not followed"
+            raise InputError(folder, what, "give the folder that they lead to, or copies")
         kinds = ", ".join((*images.SUFFIXES, *HEIC, *VIDEO))
         what = "holds no photos, no transforms.json and no COLMAP model"
         raise InputError(folder, what, f"photos are files that end in one of {kinds}")
@@ -51,18 +57,25 @@ def find_sources(folder: Path) -> tuple[Source, ...]:
 
 
 def _found(folder: Path) -> list[Source]:
-    for place in (folder, folder / "images"):
-        if place.is_dir():
-            found = [source for path in place.iterdir() if (source := _source(folder, path)) is not None]
-            if found:
-                return found
+    for place in _places(folder):
+        found = [source for path in place.iterdir() if (source := _source(folder, path)) is not None]
+        if found:
+            return found
     return []
+
+
+def _places(folder: Path) -> list[Path]:
+    return [place for place in (folder, folder / "images") if place.is_dir()]
+
+
+def _leads_out(folder: Path, path: Path) -> bool:
+    return not path.resolve().is_relative_to(folder.resolve())
 
 
 def _source(folder: Path, path: Path) -> Source | None:
     suffix = path.suffix.lower()
     hidden = path.name.startswith(".")
-    if hidden or not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
+    if hidden or not path.is_file() or _leads_out(folder, path):
         return None
     name = path.relative_to(folder).as_posix()
     if suffix in images.SUFFIXES:
