@@ -81,6 +81,23 @@ def test_what_no_photo_saw_is_new_and_no_change(tmp_path, poses):
         assert (found.witness().depth[found.new] == 0).all()
 
 
+def test_one_new_photo_is_not_believed_where_few_old_ones_looked(tmp_path):
+    few = [camera_at(angle, 34) for angle in (175, 185)]
+    old = photograph(OLD, tmp_path / "old", [*ONE_SIDE, *few])
+    (view,) = views_of(OLD, tmp_path / "new", [camera_at(180, 30)])
+    memory, config = Memory.of(OLD, old), DetectConfig()
+    errors = detect.errors([view_of(OLD, f, 10_000) for f in old], memory, config)
+    on_crate = CRATE.inside(torch.nan_to_num(torch.from_numpy(view.surface + 0.02 * view.directions))).numpy()
+    side = on_crate & (view.surface[..., 2] < 0.14)
+    painted = replace(view, photo=np.where(side[..., None], 1 - view.photo, view.photo).astype(np.float32))
+    seen = memory.times_seen(view)[side]
+    assert np.median(seen) == len(few)
+    (alone,) = detect.changes([painted], errors, config)
+    both = detect.changes([painted, painted], errors, config)
+    assert alone.mask[side].mean() > 0.7 and alone.certain[side][seen < detect.CERTAIN].mean() < 0.05
+    assert all(c.guessed is None and (c.certain == c.mask).all() and c.mask[side].mean() > 0.7 for c in both)
+
+
 def test_an_arrival_in_front_of_what_was_seen_is_found(tmp_path):
     capture = Capture(tuple(photograph(OLD, tmp_path / "old", AROUND)), held_out_every=4)
     photos = photograph(NEW, tmp_path / "new", [camera_at(angle, 34) for angle in (90, 135, 180, 225)])

@@ -43,7 +43,7 @@ def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list
 
     Each is carved on a lattice of its own: on the hull's, which holds everything, a small thing has few voxels.
     """
-    out, open_ = list[Body](), [p.open for p in past]
+    out, open_ = list[Body](), [p.open & p.changed.certain for p in past]
     some = [Body(ground.hull.lattice, part) for part in components(arrivals(ground, past, olds), 1)]
     some = [body for body in some if any(_speaks(ground, s & o) for s, o in zip(shadows_of(past, body), open_))]
     left = [(b, shadows_of(past, b)) for body in some for b in _thick(ground, _finer(ground, body, past, olds))]

@@ -66,7 +66,7 @@ def concluded(scene: Told, settled: Settled) -> SceneChange:
         masks, sure = segment.masks_in(frames, grid), confidence("added", lead, bool(settled.removed) or once)
         changes.append(ObjectChange("added", grid, masks_in=masks, confidence=sure, note=note))
     left = _unexplained(scene, settled)
-    reasons = [f"1 {c.kind}{_by(c)}: {c.note}" for c in changes]
+    reasons = [f"1 {c.kind}{_by(c)}, {100 * c.confidence:.0f} % sure: {c.note}" for c in changes]
     reasons += [_said_of(scene, left)] if left else []
     if not reasons:
         reasons = ["some pixels differ, but no object that moved, left or arrived explains them better than before"]
@@ -143,7 +143,7 @@ def _unexplained(scene: Told, settled: Settled) -> list[Mask]:
             told |= pixels.dilate(past.silhouette(c.view, old), 3)
         for body in settled.arrived:
             told |= pixels.dilate(shadow_of(c.view, body), 3)
-        left = c.mask & ~told
+        left = c.certain & ~told
         left = pixels.dilate(pixels.erode(left, 1), 1) & left
         out.append(pixels.keep_components(left, max(12, _NOTABLE * left.size)))
     unclear, changed = (sum(int(m.sum()) for m in masks) for masks in (out, [c.mask for c in scene.changed]))

@@ -22,6 +22,10 @@ from refield.vision import pixels
 Mask = NDArray[Any]
 _CLASSES = 5
 _TRUE = 0.99  # of times that nothing changed, so many are not said to be unclear
+CERTAIN = 4
+"""old photos that saw a surface, from which on one new photo is believed that it changed; what fewer saw, the field may
+have guessed, and only another new photo could tell. On real photographs false changes lie where 2 or 3 looked, true
+ones where 15 to 49 did (docs/results.md)"""
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,13 @@ class Changed:
     new: Mask
     """(H, W) what is there was seen by no old photo, and is not what the field took for granted: no change, as far as
     anyone knows"""
+    guessed: Mask | None = None
+    """(H, W) what one new photo alone is not believed: too few old photos saw what is there"""
+
+    @property
+    def certain(self) -> Mask:
+        """(H, W) of ``mask`` what is believed"""
+        return self.mask if self.guessed is None else self.mask & ~self.guessed
 
     def witness(self, depth: Array | None = None) -> View:
         """The view, with the old surface at ``depth`` (H, W), for telling where in space nothing changed: pixels that
@@ -174,11 +185,15 @@ def _by_coverage(errors: Array, of: NDArray[np.int64], quantile: float) -> Array
 def changes(views: Sequence[View], known: Errors, config: DetectConfig) -> list[Changed]:
     """Change masks of the new photos; light not yet set aside."""
     views = [carried(v, config) for v in views]
-    return _marked(views, [difference(v, v.rgb, config) for v in views], known, config)
+    enough = 1 if len(views) > 1 else CERTAIN
+    return _marked(views, [difference(v, v.rgb, config) for v in views], known, config, enough)
 
 
-def _marked(views: Sequence[View], diffs: Sequence[Array], known: Errors, config: DetectConfig) -> list[Changed]:
-    """Change masks of photos whose colours are carried over and whose differences (H, W) are known."""
+def _marked(
+    views: Sequence[View], diffs: Sequence[Array], known: Errors, config: DetectConfig, enough: int = 1
+) -> list[Changed]:
+    """Change masks of photos whose colours are carried over and whose differences (H, W) are known; what fewer than
+    ``enough`` old photos saw is guessed."""
     times = [known.memory.times_seen(v) for v in views]
     floors = [known.levels[_coverage(t)] for t in times]
     above = np.concatenate([d[(d > f) & (t > 0)] for d, f, t in zip(diffs, floors, times)])
@@ -190,5 +205,6 @@ def _marked(views: Sequence[View], diffs: Sequence[Array], known: Errors, config
         smallest, new = max(6, config.smallest * diff.size), (seen == 0) & (diff > threshold)
         mask = pixels.keep_components((diff > threshold) & ~new, smallest, seeds & ~new)
         mask = pixels.fill_holes(pixels.close(mask, 2 * round(0.012 * view.camera.width) + 3), 8 * smallest) & ~new
-        out.append(Changed(view, diff, threshold, mask, np.zeros_like(mask), new))
+        guessed = (seen < enough) & (diff > threshold) & ~new if enough > 1 else None
+        out.append(Changed(view, diff, threshold, mask, np.zeros_like(mask), new, guessed))
     return out

@@ -138,5 +138,5 @@ def changed_share(changed: Sequence[Changed], old: Old) -> float:
     for c in changed:
         here = silhouette(c.view, old)
         shown += int(here.sum())
-        touched += int((here & c.mask).sum())
+        touched += int((here & c.certain).sum())
     return touched / shown if touched >= 12 else 0.0

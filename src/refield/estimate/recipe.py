@@ -232,10 +232,15 @@ def _light(photos: Sequence[PlacedPhoto]) -> str:
 
 
 def _never_seen(changed: Sequence[Changed]) -> str:
-    """What is to be said of what no old photo saw."""
+    """What is to be said of what no old photo saw, or too few for one new one."""
     shares = [(c.view.frame.name, float(c.new.mean())) for c in changed]
     much = [f"{100 * share:.0f} % of {name}" for name, share in shares if share >= _MUCH_NEW]
-    return f"; no old photo saw what is in {', '.join(much)}, so nothing is said of it" if much else ""
+    said = f"; no old photo saw what is in {', '.join(much)}, so nothing is said of it" if much else ""
+    guessed = [(c.view.frame.name, float(c.guessed.mean())) for c in changed if c.guessed is not None]
+    for name, share in guessed:
+        if share >= _MUCH_NEW:
+            said += f"; {100 * share:.0f} % of {name} differ where fewer than {detect.CERTAIN} old photos looked"
+    return said
 
 
 def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
