@@ -16,6 +16,7 @@ from numba.core import event
 from PIL import Image
 
 from refield.field import kernels
+from refield.field.compiling import compiling
 from refield.field.descent import MOST_SKIPPED, NonFiniteError
 from refield.field.encoding import Contraction
 from refield.field.fit import FitConfig, FitProgress, _Fit, fit_field
@@ -403,6 +404,16 @@ def test_pixels_on_a_device_are_the_banks(capture: Capture) -> None:
     assert len(device) == len(bank)
     torch.testing.assert_close(device.rays(chosen).directions, bank.rays(chosen).directions)
     assert torch.equal(device.colours(chosen), bank.colours(chosen))
+
+
+def test_what_triton_compiles_in_a_fit_within_a_fit_is_heard_by_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    knobs = pytest.importorskip("triton").knobs
+    said: list[float] = []
+    monkeypatch.setattr(knobs.compilation, "listener", lambda *, times, **_: said.append(times.total))
+    with compiling(triton=True) as fit, compiling(triton=True) as look:
+        knobs.compilation.listener(times=SimpleNamespace(total=2e6), cache_hit=False)
+    knobs.compilation.listener(times=SimpleNamespace(total=1e6), cache_hit=False)
+    assert fit.seconds == look.seconds == 2 and said == [2e6, 1e6]
 
 
 def test_what_compiles_before_the_first_step_takes_no_time_from_the_fit(

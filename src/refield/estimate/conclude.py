@@ -79,7 +79,7 @@ def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...], err
     """The answer where the photos' changes meet nowhere in space; told if they are more than the odd spot, and more
     than the field's ``errors`` are in photos that show no change."""
     why = "the pixels that differ agree on no place that more than one photo shows"
-    shares = [float(c.mask.mean()) for c in changed]
+    shares = [float(c.certain.mean()) for c in changed]
     most = int(np.argmax(shares))
     if shares[most] < _LARGE:
         return SceneChange((), photos, why)
@@ -88,7 +88,7 @@ def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...], err
         return SceneChange((), photos, f"{why}; {alone}")
     share = 100 * float(np.mean(shares))
     why += f"; {share:.0f} % of the photos' pixels are not understood: do the photos show one and the same state?"
-    return SceneChange((), photos, why, unexplained=tuple(full_size(c.mask, c.view.frame) for c in changed))
+    return SceneChange((), photos, why, unexplained=tuple(full_size(c.certain, c.view.frame) for c in changed))
 
 
 def _moved(frames: Sequence[Frame], settled: Settled, k: int) -> ObjectChange:
@@ -146,13 +146,13 @@ def _unexplained(scene: Told, settled: Settled) -> list[Mask]:
         left = c.certain & ~told
         left = pixels.dilate(pixels.erode(left, 1), 1) & left
         out.append(pixels.keep_components(left, max(12, _NOTABLE * left.size)))
-    unclear, changed = (sum(int(m.sum()) for m in masks) for masks in (out, [c.mask for c in scene.changed]))
+    unclear, changed = (sum(int(m.sum()) for m in masks) for masks in (out, [c.certain for c in scene.changed]))
     unusual = scene.errors.unusual([float(m.mean()) for m in out])
     return out if unclear > _MUCH * changed and unusual else []
 
 
 def _said_of(scene: Told, left: Sequence[Mask]) -> str:
-    share = sum(int(m.sum()) for m in left) / max(sum(int(c.mask.sum()) for c in scene.changed), 1)
+    share = sum(int(m.sum()) for m in left) / max(sum(int(c.certain.sum()) for c in scene.changed), 1)
     points = np.concatenate([c.view.surface[m & np.isfinite(c.view.depth)] for c, m in zip(scene.changed, left)])
     where = ""
     if len(points):

@@ -24,8 +24,8 @@ _CLASSES = 5
 _TRUE = 0.99  # of times that nothing changed, so many are not said to be unclear
 CERTAIN = 4
 """old photos that saw a surface, from which on one new photo is believed that it changed; what fewer saw, the field may
-have guessed, and only another new photo could tell. On real photographs false changes lie where 2 or 3 looked, true
-ones where 15 to 49 did (docs/results.md)"""
+have guessed, and only another new photo could tell. Half of the false changes on real photographs lie where 2 or 3
+looked, true ones where 15 to 49 did (docs/results.md)"""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Changed:
     """(H, W) what is there was seen by no old photo, and is not what the field took for granted: no change, as far as
     anyone knows"""
     guessed: Mask | None = None
-    """(H, W) what one new photo alone is not believed: too few old photos saw what is there"""
+    """(H, W) of ``mask`` what one new photo alone is not believed: too few old ones saw what is there"""
 
     @property
     def certain(self) -> Mask:
@@ -205,6 +205,6 @@ def _marked(
         smallest, new = max(6, config.smallest * diff.size), (seen == 0) & (diff > threshold)
         mask = pixels.keep_components((diff > threshold) & ~new, smallest, seeds & ~new)
         mask = pixels.fill_holes(pixels.close(mask, 2 * round(0.012 * view.camera.width) + 3), 8 * smallest) & ~new
-        guessed = (seen < enough) & (diff > threshold) & ~new if enough > 1 else None
+        guessed = mask & (seen < enough) if enough > 1 else None
         out.append(Changed(view, diff, threshold, mask, np.zeros_like(mask), new, guessed))
     return out

@@ -132,7 +132,7 @@ def estimate_change(
     scene = replace(_detected(capture, field, frames, config, models), known=tuple(known))
     photos = scene.photos
     beside = _light(photos) + _never_seen(scene.changed)
-    if not any(c.mask.any() for c in scene.changed):
+    if not any(c.certain.any() for c in scene.changed):
         why = "no pixel differs by more than the field's own errors on the old photos"
         return SceneChange((), photos, why + beside)
     say("hull")
@@ -236,7 +236,7 @@ def _never_seen(changed: Sequence[Changed]) -> str:
     shares = [(c.view.frame.name, float(c.new.mean())) for c in changed]
     much = [f"{100 * share:.0f} % of {name}" for name, share in shares if share >= _MUCH_NEW]
     said = f"; no old photo saw what is in {', '.join(much)}, so nothing is said of it" if much else ""
-    guessed = [(c.view.frame.name, float(c.guessed.mean())) for c in changed if c.guessed is not None]
+    guessed = [(c.view.frame.name, float((c.mask & c.guessed).mean())) for c in changed if c.guessed is not None]
     for name, share in guessed:
         if share >= _MUCH_NEW:
             said += f"; {100 * share:.0f} % of {name} differ where fewer than {detect.CERTAIN} old photos looked"

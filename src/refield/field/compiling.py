@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from numba.core import event
@@ -41,11 +41,31 @@ class Compiling(event.Listener):
 
 
 @contextmanager
-def compiling() -> Iterator[Compiling]:
-    """Listen while the block runs."""
+def compiling(triton: bool = False) -> Iterator[Compiling]:
+    """Listen while the block runs, to Triton as well where kernels run on a GPU."""
     listener = Compiling()
-    event.register(_KIND, listener)
-    try:
+    with ExitStack() as stack:
+        event.register(_KIND, listener)
+        stack.callback(event.unregister, _KIND, listener)
+        if triton:
+            stack.enter_context(_hearing_triton(listener))
         yield listener
+
+
+@contextmanager
+def _hearing_triton(listener: Compiling) -> Iterator[None]:
+    """Let a listener know what Triton compiles, and whoever listened before."""
+    from triton import knobs
+
+    before = knobs.compilation.listener
+
+    def hear(*, times: Any, **what: Any) -> None:
+        listener.compiled(times.total / 1e6)
+        if before is not None:
+            before(times=times, **what)
+
+    knobs.compilation.listener = hear
+    try:
+        yield
     finally:
-        event.unregister(_KIND, listener)
+        knobs.compilation.listener = before

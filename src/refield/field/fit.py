@@ -172,7 +172,10 @@ def fit_capture(
     check_capture(capture)
     expect("the config of a fit", config, FitConfig, "a refield.field.fit.FitConfig")
     capture, since = as_read(capture, since, config.size)
-    with compiling() as clock:
+    on_gpu = config.device == "cuda"
+    if on_gpu:
+        _check_gpu(config, since)
+    with compiling(triton=on_gpu) as clock:
         photos = Photos.of(capture, since, most_pixels(config))
         core = _core(capture, config) if start is None and config.look_around else None
         left_out: list[float] = []  # of each fit that was given up
@@ -182,7 +185,7 @@ def fit_capture(
             torch.manual_seed(seed)
             model = new_field(capture, config, seed, core) if start is None else opened(start)
             try:
-                if config.device == "cuda":
+                if on_gpu:
                     found = _fit_on_gpu(model, capture, photos, config, (on_progress, on_step), clock)
                 else:
                     may_give_up = start is None and attempt < _TRIES - 1
@@ -223,6 +226,13 @@ def _core(capture: Capture, config: FitConfig) -> Contraction:
     return around(core, first, frames)
 
 
+def _check_gpu(config: FitConfig, since: Since) -> None:
+    """Raises InputError: there is no GPU, or it cannot fit so."""
+    need_device(config.device)
+    if not config.directions or since.share is not None:
+        raise InputError("device cuda", "draws all pixels alike, in colours that depend on the direction", "fit on cpu")
+
+
 def _fit_on_gpu(
     model: HashField,
     capture: Capture,
@@ -231,9 +241,6 @@ def _fit_on_gpu(
     told: tuple[ProgressCallback | None, StepCallback | None],
     clock: Compiling,
 ) -> Capture:
-    need_device(config.device)
-    if not config.directions or photos.since.share is not None:
-        raise InputError("device cuda", "draws all pixels alike, in colours that depend on the direction", "fit on cpu")
     from refield.field.gpu_fit import fit_on_gpu
 
     return fit_on_gpu(model, capture, photos, config, *told, clock)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import torch
 
@@ -61,34 +58,14 @@ def fit_on_gpu(
     known = photos.knowable(model.sampler).to(device), beside(model.sampler, photos.train).to(device)
     outside = stand_outside(model.contraction, photos.train)
     move(model, device)
-    clock = clock or Compiling()
     try:
         # what is made in here without a device named is made on the GPU
-        with torch.device(device), _hearing_triton(clock):
+        with torch.device(device):
             fit = _GpuFit(model, photos, config, (known, outside), (on_progress, on_step), clock)
             fit.run()
             return fit.photos.told(capture, fit.judge, model)
     finally:
         move(model, home)
-
-
-@contextmanager
-def _hearing_triton(clock: Compiling) -> Iterator[None]:
-    """Let the clock know while Triton compiles, and whoever else listens."""
-    from triton import knobs
-
-    before = knobs.compilation.listener
-
-    def hear(*, times: Any, **what: Any) -> None:
-        clock.compiled(times.total / 1e6)
-        if before is not None:
-            before(times=times, **what)
-
-    knobs.compilation.listener = hear
-    try:
-        yield
-    finally:
-        knobs.compilation.listener = before
 
 
 def move(model: HashField, device: torch.device) -> None:

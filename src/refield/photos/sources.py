@@ -43,7 +43,7 @@ def find_sources(folder: Path) -> tuple[Source, ...]:
             what = f"holds no photos itself, but folders of photos ({named(below)})"
             raise InputError(folder, what, "give one of them: each visit's photos are a folder of their own")
         out = sorted(
-            p.name for place in _places(folder) for p in place.iterdir() if p.is_file() and _leads_out(folder, p)
+            p.name for place in _places(folder) for p in place.iterdir() if _is_photo(p) and _leads_out(folder, p)
         )
         if out:
             what = f"holds no photos, but links that lead out of it ({named(out)}), which are not followed"
@@ -72,17 +72,22 @@ def _leads_out(folder: Path, path: Path) -> bool:
     return not path.resolve().is_relative_to(folder.resolve())
 
 
+def _is_photo(path: Path) -> bool:
+    """Or a video, by its name."""
+    kinds = (*images.SUFFIXES, *HEIC, *VIDEO)
+    return not path.name.startswith(".") and path.suffix.lower() in kinds and path.is_file()
+
+
 def _source(folder: Path, path: Path) -> Source | None:
-    suffix = path.suffix.lower()
-    hidden = path.name.startswith(".")
-    if hidden or not path.is_file() or _leads_out(folder, path):
+    if not _is_photo(path) or _leads_out(folder, path):
         return None
+    suffix = path.suffix.lower()
     name = path.relative_to(folder).as_posix()
     if suffix in images.SUFFIXES:
         return Source(path, name, "picture")
     if suffix in HEIC:
         return Source(path, name, "heic")
-    return Source(path, name, "video") if suffix in VIDEO else None
+    return Source(path, name, "video")
 
 
 def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:

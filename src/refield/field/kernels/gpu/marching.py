@@ -3,7 +3,7 @@
 Two walks over each ray, because a ray's room is known only after the first, and a fixed room a ray would be either too
 small while the grid is still full or mostly empty later. The second walk needs no density even where the first one
 ended at an opaque surface: it stops at the count. One lane walks one ray, and a program is one warp, so that only 32
-rays wait for the longest of them.
+rays wait for the longest of them, and 16 where densities are looked up on the way.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ from refield.field.kernels.gpu.networks import density_shape, matrix, raw_densit
 from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 
 _RAYS = {"BLOCK": 32, "num_warps": 1}
-_SEEING = {"BLOCK": 16, "num_warps": 1}  # more warps wait for the longest of more rays; more places a warp spill
+_SEEING = {
+    "BLOCK": 16,
+    "num_warps": 1,
+}  # with more rays more wait for the longest; 32 a warp do not fit into its registers
 
 
 @triton.jit
