@@ -25,10 +25,6 @@ class Compiling(event.Listener):
         """Seconds since this listens, without those."""
         return time.perf_counter() - self._began - self.seconds
 
-    def compiled(self, seconds: float) -> None:
-        """Another compiler took so long."""
-        self.seconds += seconds
-
     def on_start(self, event: Any) -> None:
         if self._depth == 0:
             self._since = time.perf_counter()
@@ -60,7 +56,7 @@ def _hearing_triton(listener: Compiling) -> Iterator[None]:
     before = knobs.compilation.listener
 
     def hear(*, times: Any, **what: Any) -> None:
-        listener.compiled(times.total / 1e6)
+        listener.seconds += times.total / 1e6
         if before is not None:
             before(times=times, **what)
 

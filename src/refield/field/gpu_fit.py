@@ -59,8 +59,7 @@ def fit_on_gpu(
     outside = stand_outside(model.contraction, photos.train)
     move(model, device)
     try:
-        # what is made in here without a device named is made on the GPU
-        with torch.device(device):
+        with torch.device(device):  # what is made in here without a device named is made on the GPU
             fit = _GpuFit(model, photos, config, (known, outside), (on_progress, on_step), clock)
             fit.run()
             return fit.photos.told(capture, fit.judge, model)

@@ -13,6 +13,7 @@ from refield.scene.left_out import named
 
 HEIC = (".heic", ".heif", ".hif")
 VIDEO = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+_SUFFIXES = (*images.SUFFIXES, *HEIC, *VIDEO)
 MOST = 5000
 """files; more are more likely a mistake than a capture"""
 
@@ -48,9 +49,8 @@ def find_sources(folder: Path) -> tuple[Source, ...]:
         if out:
             what = f"holds no photos, but links that lead out of it ({named(out)}), which are not followed"
             raise InputError(folder, what, "give the folder that they lead to, or copies")
-        kinds = ", ".join((*images.SUFFIXES, *HEIC, *VIDEO))
         what = "holds no photos, no transforms.json and no COLMAP model"
-        raise InputError(folder, what, f"photos are files that end in one of {kinds}")
+        raise InputError(folder, what, f"photos are files that end in one of {', '.join(_SUFFIXES)}")
     if len(found) > MOST:
         raise InputError(folder, f"holds {len(found)} photos, the limit is {MOST}", "give the folder of one capture")
     return tuple(sorted(found, key=lambda s: _natural(s.name)))
@@ -74,8 +74,7 @@ def _leads_out(folder: Path, path: Path) -> bool:
 
 def _is_photo(path: Path) -> bool:
     """Or a video, by its name."""
-    kinds = (*images.SUFFIXES, *HEIC, *VIDEO)
-    return not path.name.startswith(".") and path.suffix.lower() in kinds and path.is_file()
+    return not path.name.startswith(".") and path.suffix.lower() in _SUFFIXES and path.is_file()
 
 
 def _source(folder: Path, path: Path) -> Source | None:

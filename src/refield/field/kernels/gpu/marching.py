@@ -20,10 +20,8 @@ from refield.field.kernels.gpu.networks import density_shape, matrix, raw_densit
 from refield.field.kernels.reference import DensityNet, Lattice, Rays3, Space
 
 _RAYS = {"BLOCK": 32, "num_warps": 1}
-_SEEING = {
-    "BLOCK": 16,
-    "num_warps": 1,
-}  # with more rays more wait for the longest; 32 a warp do not fit into its registers
+# with more rays more wait for the longest; 32 a warp do not fit into its registers
+_SEEING = {"BLOCK": 16, "num_warps": 1}
 
 
 @triton.jit
