@@ -16,6 +16,7 @@ from refield.vision import pixels
 CONFIG = DetectConfig()
 SIDE = 120
 SHADE = np.s_[20:80, 20:90]
+EVERYWHERE = np.ones((SIDE, SIDE), bool)
 
 
 def pattern(seed: int, sigma: float = 2.0) -> np.ndarray:
@@ -70,16 +71,26 @@ def test_a_plain_thing_before_a_patterned_wall_is_no_light():
     assert told.mask[SHADE].mean() > 0.9
 
 
+def test_a_small_thing_that_left_is_no_light_before_a_wall_that_stayed():
+    """Around it there is more of the wall than there is of itself."""
+    field, photo = pattern(0), pattern(0)
+    small = np.s_[50:57, 50:57]
+    field[small], photo[small] = 0.9 * pattern(4)[small][..., :1], 0.4  # grey and patterned, before a plain patch
+    assert same_detail(view_of(photo, field), EVERYWHERE, CONFIG)[small].mean() > 0.9
+    (told,) = set_light_aside([marked(view_of(photo, field), small)], [], CONFIG)
+    assert told.mask[small].mean() > 0.9
+
+
 def test_a_plain_wall_tells_nothing():
     field = np.full((SIDE, SIDE, 3), 0.6, np.float32)
-    assert not same_detail(view_of(0.8 * field, field), CONFIG).any()
+    assert not same_detail(view_of(0.8 * field, field), EVERYWHERE, CONFIG).any()
 
 
 def test_detail_is_known_however_bright():
     field = pattern(3)
-    assert same_detail(view_of(to_srgb(0.3 * to_linear(field)), field), CONFIG).mean() > 0.95
-    assert same_detail(view_of(pattern(4), field), CONFIG).mean() < 0.05
-    assert not same_detail(view_of(1 - field, field), CONFIG).any()  # a negative is no light
+    assert same_detail(view_of(to_srgb(0.3 * to_linear(field)), field), EVERYWHERE, CONFIG).mean() > 0.95
+    assert same_detail(view_of(pattern(4), field), EVERYWHERE, CONFIG).mean() < 0.05
+    assert not same_detail(view_of(1 - field, field), EVERYWHERE, CONFIG).any()  # a negative is no light
 
 
 def test_dark_channels_have_no_tint():

@@ -283,3 +283,12 @@ def test_an_object_that_explains_nothing_is_taken_back(capture, tmp_path, monkey
     change, _ = settled(capture, tmp_path, monkeypatch)
     assert sorted(o.kind for o in change.objects) == (["moved"] if known else ["added", "removed"])
     assert not known or float(angle_between(change.objects[0].new_from_old, AWAY)) < 1.5
+
+
+@pytest.mark.parametrize(("left", "taken"), [(8.0, True), (12.0, False)])
+def test_more_objects_are_taken_only_where_they_leave_less_unexplained(monkeypatch, left, taken):
+    begun, more = Settled(), Settled(touched=(1,))
+    monkeypatch.setattr(settle, "judged", lambda ground, one: (one, 10.0 if one is begun else left))
+    monkeypatch.setattr(settle.Search, "_placed", lambda self, olds, before: more)
+    monkeypatch.setattr(settle.Search, "_exchanges", lambda self, best: [])
+    assert (settle.Search(None, []).settle([], begun).touched == (1,)) is taken

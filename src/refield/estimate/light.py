@@ -46,7 +46,7 @@ def set_light_aside(changed: Sequence[Changed], planes: Sequence[Plane], config:
     for i, c in enumerate(changed):
         agrees, denies, asked = _agreement(i, changed, ratios)
         flat = _on_planes(c.view, planes) & (denies == 0) & (agrees >= 1)
-        there = flat | (agrees >= np.maximum(2, 0.6 * asked)) | same_detail(c.view, config)
+        there = flat | (agrees >= np.maximum(2, 0.6 * asked)) | same_detail(c.view, c.mask, config)
         light = c.mask & ratios[i].even_and_grey & there
         light = cv2.medianBlur(light.astype(np.uint8), 5).astype(bool) & c.mask
         smallest = max(6, config.smallest * light.size)
@@ -96,18 +96,36 @@ class Ratio:
         return even & (np.abs(self.tint).max(-1) < tint(self.mean)) & (np.abs(self.mean) < np.log(LARGEST))
 
 
-def same_detail(view: View, config: DetectConfig) -> Mask:
-    """Pixels around which the photo's detail is what the field shows, however bright either is, (H, W)."""
+def same_detail(view: View, changed: Mask, config: DetectConfig) -> Mask:
+    """Pixels around which the photo's detail is what the field shows, however bright either is, (H, W).
+
+    Around a small thing that left or came, most of what is compared stayed. So the ``changed`` pixels (H, W) are asked
+    alone as well: their detail must be the field's, too, or their ratio to it even.
+    """
     sigma = blur_sigma(view, config)
-    seen, shown = (_detail(pixels.blur(im, sigma), _AROUND * sigma) for im in (view.photo, view.rgb))
-    both, one, other = (pixels.blur(product, _AROUND * sigma) for product in (seen * shown, seen**2, shown**2))
-    return (both > 0) & (both**2 > _ALIKE * one * other)
+    alike, _ = _compared(view, np.ones_like(changed), sigma)
+    return alike & np.logical_or(*_compared(view, changed, sigma))
 
 
-def _detail(image: Array, sigma: float) -> Array:
+def _compared(view: View, among: Mask, sigma: float) -> tuple[Mask, Mask]:
+    """Where the photo's detail is the field's, and where the photo's ratio to the field is even, (H, W) each: around a
+    pixel, asked of the pixels ``among`` (H, W) alone."""
+    seen, shown = (_detail(im, among, sigma) for im in (view.photo, view.rgb))
+    both, one, other = (_mean(product, among, _AROUND * sigma) for product in (seen * shown, seen**2, shown**2))
+    return (both > 0) & (both**2 > _ALIKE * one * other), one + other - 2 * both < _EVEN**2
+
+
+def _detail(image: Array, among: Mask, sigma: float) -> Array:
     """(H, W) log of linear light, beside what it is around."""
-    light = np.log(to_linear(image).sum(-1) + DARK)
-    return (light - pixels.blur(light, sigma)).astype(np.float32)
+    light = np.log(to_linear(_mean(image, among, sigma)).sum(-1) + DARK)
+    return (light - _mean(light, among, _AROUND * sigma)).astype(np.float32)
+
+
+def _mean(image: Array, among: Mask, sigma: float) -> Array:
+    """An image (H, W) or (H, W, 3), blurred from the pixels ``among`` (H, W) alone."""
+    weight = among.astype(np.float32)
+    every = weight if image.ndim == 2 else weight[..., None]
+    return (pixels.blur(image * every, sigma).T / np.maximum(pixels.blur(weight, sigma), 1e-6).T).T
 
 
 def tint(mean: Array) -> Array:

@@ -75,7 +75,7 @@ class Search:
     def settle(self, olds: Sequence[Old], begun: Settled | None = None) -> Settled:
         """Find each old object's new place or that it left, and what else arrived.
 
-        ``begun``: what was settled before these objects were known.
+        ``begun``: what was settled before these objects were known; it stays unless they leave less unexplained.
         """
         best, least = judged(self.ground, self._placed(olds, begun or Settled()))
         again = True
@@ -89,6 +89,8 @@ class Search:
                 other, tried[this] = min(others, key=lambda o: o[1], default=(best, math.inf))
                 if tried[this] < least - 1:  # pixel
                     again, best, least, tried = True, other, tried[this], {}
+        if begun is not None and judged(self.ground, begun)[1] <= least:
+            return begun
         return self._led(best, least, tried)
 
     def _led(self, best: Settled, least: float, tried: dict[_Which, float]) -> Settled:
