@@ -124,8 +124,10 @@ def _detail(image: Array, among: Mask, sigma: float) -> Array:
 def _mean(image: Array, among: Mask, sigma: float) -> Array:
     """An image (H, W) or (H, W, 3), blurred from the pixels ``among`` (H, W) alone."""
     weight = among.astype(np.float32)
-    every = weight if image.ndim == 2 else weight[..., None]
-    return (pixels.blur(image * every, sigma).T / np.maximum(pixels.blur(weight, sigma), 1e-6).T).T
+    share = np.maximum(pixels.blur(weight, sigma), 1e-6)
+    if image.ndim == 3:
+        weight, share = weight[..., None], share[..., None]
+    return pixels.blur(weight * image, sigma) / share
 
 
 def tint(mean: Array) -> Array:
