@@ -12,6 +12,9 @@ from refield.field.nerfacto import NerfactoField
 from refield.field.radiance import HashField
 
 MOST_SKIPPED = 20  # steps in a row
+NETWORKS = 0.25
+"""of the tables' learning rate. At all of it the colours of what is dark ran to black, where their slope vanishes, and
+often stayed there"""
 
 
 class NonFiniteError(RuntimeError):
@@ -58,8 +61,9 @@ class TableAdam:
             return False
         self.count, self.left_out = self.count + 1, 0
         with torch.no_grad():
-            for p, grad, first, second in zip(self.parameters, self.grads, self.first, self.second):
-                kernels.adam(p, grad, first, second, rate, self.count)
+            rates = [rate, *(NETWORKS * rate for _ in self.parameters[1:])]
+            for p, grad, first, second, each in zip(self.parameters, self.grads, self.first, self.second, rates):
+                kernels.adam(p, grad, first, second, each, self.count)
             if self.decay and self.count % FADE_EVERY == 0:
                 self.parameters[0].mul_(fading(self.decay, rate))
         return True

@@ -44,7 +44,7 @@ class FitConfig:
     samples_per_ray: float = 40
     """the lattice along the ray is made coarser, up to 1.5 times, while a ray needs more than this"""
     rate: float = 2e-2
-    """Adam's learning rate, held for the first half, then brought down to a thirtieth"""
+    """Adam's learning rate, held for half, then brought down to a thirtieth; the networks' is a quarter of it"""
     decay: float | None = None
     """of the tables' entries, times the learning rate; by default as the quality says, none without one"""
     distortion: float = 1e-2

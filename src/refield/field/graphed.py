@@ -11,6 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from refield.field.descent import NETWORKS
 from refield.field.kernels import gpu
 from refield.field.kernels.reference import Aim, Lattice, Space, Stepped
 from refield.field.photo_model import Asked, PhotoModel
@@ -105,8 +106,9 @@ class Descent:
         for grad in self._grads:
             grad.masked_fill_(~good, 0)  # what has no gradient rests
         scale = gpu.adam_scale(self.rate, self.count.clamp_min(1), self.tables.device)
-        for parts in zip(self._parameters, self.into, self._first, self._second):
-            gpu.descend(*parts, scale)
+        scales = [scale, *(NETWORKS * scale for _ in self.networks)]
+        for parts in zip(self._parameters, self.into, self._first, self._second, scales):
+            gpu.descend(*parts)
         return good
 
 

@@ -46,7 +46,7 @@ class HelperConfig:
     """let its colours depend on the direction, as the paper's do; what few photos say of that does not hold between
     them"""
     rate: float = 2e-2
-    """Adam's learning rate, held for the first half, then brought down to a thirtieth"""
+    """Adam's learning rate, held for half, then brought down to a thirtieth; the networks' is a quarter of it"""
     distortion: float = 1e-2
     """weight of the distortion loss"""
     gradient_unit: float = 1.0

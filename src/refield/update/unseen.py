@@ -13,6 +13,7 @@ from torch import Tensor
 from refield.field.radiance import Field
 from refield.field.render import render_camera
 from refield.field.sampling import OccupancySampler
+from refield.field.volrend import depths_around
 from refield.scene.capture import Frame
 
 _EYES = 24  # old photos asked at most, spread over all
@@ -31,7 +32,9 @@ class Sight:
     """(K,) flat indices"""
     before: Tensor
     """(K,) by how many cells each lies before the surface that a photo shows there, at most over all photos; negative
-    behind it"""
+    behind it. The farthest surface of the pixel and of those around it, which may be what shows at the cell"""
+    through: Tensor
+    """(K,) the same, before the nearest surface of these"""
 
     @property
     def hidden(self) -> Tensor:
@@ -49,7 +52,7 @@ class Sight:
     def possible(self) -> OccupancySampler:
         """Looks wherever something may be, for all that is known: not into empty cells that were looked through."""
         grid = torch.ones_like(self.sampler.grid)
-        seen = self.cells[self.before > _BEFORE]
+        seen = self.cells[self.through > _BEFORE]
         grid.view(-1)[seen] = self.sampler.grid.reshape(-1)[seen]
         return replace(self.sampler, grid=grid, fine=None)
 
@@ -60,7 +63,7 @@ def sight_of(field: Field, frames: Sequence[Frame], boxes: Sequence[Tensor]) -> 
     cells = torch.cat([s.cells_in(b) for b in boxes]).unique()
     x = s.points_in(cells, jitter=False)
     side = s.width(s.distance(cells))
-    before = torch.full((len(cells),), -torch.inf)
+    before, through = (torch.full((len(cells),), -torch.inf) for _ in range(2))
     for frame in frames[:: -(-len(frames) // _EYES) or 1]:
         camera = frame.camera.shrunk(min(_SIDE / max(frame.camera.width, frame.camera.height), 1.0))
         pose = frame.world_from_cam
@@ -70,12 +73,13 @@ def sight_of(field: Field, frames: Sequence[Frame], boxes: Sequence[Tensor]) -> 
             continue
         j, i = uv[rows].long().unbind(-1)
         seen = render_camera(field, camera, pose)
-        depth = seen.surface(0.5)[i, j]  # nothing is in the way of nothing
+        nearest, farthest = depths_around(seen.surface(0.5))  # nothing is in the way of nothing
         away = (x[rows] - frame.centre.float()).norm(dim=-1)
-        before[rows] = torch.maximum(before[rows], (depth - away) / side[rows])
-    return Sight(s, cells, before)
+        for most, depth in ((before, farthest), (through, nearest)):
+            most[rows] = torch.maximum(most[rows], (depth[i, j] - away) / side[rows])
+    return Sight(s, cells, before, through)
 
 
 def nothing_seen(field: Field) -> Sight:
     """Nothing is known of what photos saw: nothing is hidden, and something may be anywhere."""
-    return Sight(field.sampler, torch.zeros(0, dtype=torch.long), torch.zeros(0))
+    return Sight(field.sampler, torch.zeros(0, dtype=torch.long), torch.zeros(0), torch.zeros(0))
