@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -51,6 +53,23 @@ def test_what_lies_inside_is_hidden_and_what_was_looked_through_is_empty() -> No
     hidden, possible = asked(BallWorld((SHELL,), floor=False), points)
     assert hidden == [True, False, False, True, False]
     assert possible == [True, True, False, True, False]  # of what is inside nobody knows
+
+
+def test_what_shows_right_beside_something_nearer_was_seen() -> None:
+    """A photo's pixel that shows the edge of a ball shows the floor beside it as well."""
+    field = BallWorld((Ball(at(0.0, 0.0, 0.6), 0.3),))
+    pose = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    pose[2, 3] = 2.0
+    above = replace(frames()[0], world_from_cam=pose)
+    sight = sight_of(field, [above], [BOX])
+    edge = 2.0 * 0.3 / (1.4**2 - 0.3**2) ** 0.5  # of what the ball hides of the floor
+
+    def hidden(radius: float) -> float:
+        turn = torch.arange(360) * torch.pi / 180
+        x = torch.stack([radius * turn.cos(), radius * turn.sin(), torch.full_like(turn, -0.01)], -1)
+        return float(torch.isin(sight.sampler.cells(x), sight.hidden).float().mean())
+
+    assert hidden(edge - 0.15) == 1.0 and hidden(edge + 0.01) < 0.3
 
 
 def test_hidden_cells_are_not_shown_unless_something_new_answers_for_them() -> None:

@@ -12,9 +12,9 @@ from refield.field.nerfacto import NerfactoField
 from refield.field.radiance import HashField
 
 MOST_SKIPPED = 20  # steps in a row
-NETWORKS = 0.25
-"""of the tables' learning rate. At all of it the colours of what is dark ran to black, where their slope vanishes, and
-often stayed there"""
+NETWORKS = 0.5
+"""of the tables' learning rate. At all of it the colours of what is dark may run to black, where their slope vanishes,
+and stay there"""
 
 
 class NonFiniteError(RuntimeError):
@@ -32,9 +32,9 @@ FADE_EVERY = 16  # steps: to go through the whole of large tables costs as much 
 class TableAdam:
     """Adam for a hash field: what has no gradient rests, in the tables as in the matrices."""
 
-    def __init__(self, model: HashField, decay: float = 0.0) -> None:
-        """``decay``: see `fading`."""
-        self.decay = decay
+    def __init__(self, model: HashField, decay: float = 0.0, networks: float = NETWORKS) -> None:
+        """``decay``: see `fading`; ``networks``: their learning rate, as a part of the tables'."""
+        self.decay, self.networks = decay, networks
         self.parameters = [model.encoding.tables, *model.networks]
         self.grads = [large_zeros(*p.shape) for p in self.parameters]
         """where a step's gradients are added up; cleared by :meth:`step`"""
@@ -61,7 +61,7 @@ class TableAdam:
             return False
         self.count, self.left_out = self.count + 1, 0
         with torch.no_grad():
-            rates = [rate, *(NETWORKS * rate for _ in self.parameters[1:])]
+            rates = [rate, *(self.networks * rate for _ in self.parameters[1:])]
             for p, grad, first, second, each in zip(self.parameters, self.grads, self.first, self.second, rates):
                 kernels.adam(p, grad, first, second, each, self.count)
             if self.decay and self.count % FADE_EVERY == 0:

@@ -29,6 +29,7 @@ from refield.update.unseen import Sight
 
 _RAYS = 1024, 8192  # of a step, at least and at most
 _NEW = 0.5  # of a step's rays from the new photos: they alone show what arrived, and are few beside the old
+_NETWORKS = 0.25  # of the tables' learning rate: less than in a whole fit, whose many steps bring black colours back
 _PER_RAY = 0.5  # samples of a ray, at least, when rays are counted out for a step
 
 
@@ -46,7 +47,7 @@ class HelperConfig:
     """let its colours depend on the direction, as the paper's do; what few photos say of that does not hold between
     them"""
     rate: float = 2e-2
-    """Adam's learning rate, held for half, then brought down to a thirtieth; the networks' is a quarter of it"""
+    """Adam's learning rate, held for the first half, then brought to a thirtieth; a quarter of it in the networks"""
     distortion: float = 1e-2
     """weight of the distortion loss"""
     gradient_unit: float = 1.0
@@ -107,7 +108,7 @@ class HelperTraining:
         empty = emptiness(frozen.change, helper.sampler, taken, ground, sight)
         self.misplaced = config.emptiness * empty
         self.occupancy = HelperOccupancy(helper, draw, (empty == 1) & (config.emptiness > 0))
-        self.adam = TableAdam(helper)
+        self.adam = TableAdam(helper, networks=_NETWORKS)
         self.rays_per_step, self.steps_done = _RAYS[0], 0
         self.why_stopped = "all steps done"
 
