@@ -98,7 +98,8 @@ def test_what_was_looked_through_is_empty_and_what_was_seen_beneath_the_floor_ma
     x = torch.tensor([[0.26, 0.0, 0.2], [0.05, 0.05, -0.09], [-0.05, 0.05, -0.09]])
     free, hidden, leg = cells.cells(x)
     empty = replace(cells, grid=torch.zeros_like(cells.grid))
-    sight = Sight(empty, torch.stack([free, hidden, leg]), torch.tensor([3.0, -3.0, -1.0]))
+    before = torch.tensor([3.0, -3.0, -1.0])
+    sight = Sight(empty, torch.stack([free, hidden, leg]), before, before)
     found = emptiness(SceneChange((box_at(0.0),)), cells, Region(()), footholds([box_at(0.0).grid], planes), sight)
     assert found[free] == 1 and found[hidden] == 0.5 and found[leg] == 0
 
@@ -109,7 +110,7 @@ def test_the_skin_that_the_old_field_shows_around_what_left_is_as_empty_as_its_r
     x = torch.tensor([[0.22, 0.0, 0.2], [0.28, 0.0, 0.2], [0.0, 0.22, -0.04]])  # its side is at 0.19
     coarse = replace(cells, grid=torch.ones(32, 32, 32, dtype=torch.uint8))
     assert 0.03 < coarse.width(torch.tensor(0.5)) < 0.05
-    seen = Sight(coarse, torch.tensor([], dtype=torch.long), torch.tensor([]))
+    seen = Sight(coarse, torch.tensor([], dtype=torch.long), torch.tensor([]), torch.tensor([]))
     for ground, tolls in ((footholds([box_at(0.0).grid], planes), [0.5, 0.0, 0.0]), ((), [0.0, 0.0, 0.0])):
         found = emptiness(SceneChange((box_at(0.0),)), cells, Region(()), ground, seen)
         assert found[cells.cells(x)].tolist() == tolls
@@ -119,7 +120,7 @@ def test_around_what_is_small_beside_the_old_field_s_cells_only_as_much_as_its_r
     cells = move_out(SceneChange((box_at(0.0),)), 1.5).sampler(0.02)
     planes = [Plane(np.array([0, 0, 1], np.float32), 0.0, 0.002)]
     huge = replace(cells, grid=torch.ones(4, 4, 4, dtype=torch.uint8))
-    seen = Sight(huge, torch.tensor([], dtype=torch.long), torch.tensor([]))
+    seen = Sight(huge, torch.tensor([], dtype=torch.long), torch.tensor([]), torch.tensor([]))
     x = torch.tensor([[0.21, 0.0, 0.2], [0.26, 0.0, 0.2]])  # its side is at 0.19, its rim 0.05 deep
     found = emptiness(SceneChange((box_at(0.0),)), cells, Region(()), footholds([box_at(0.0).grid], planes), seen)
     assert found[cells.cells(x)].tolist() == [0.5, 0.0]
