@@ -245,8 +245,9 @@ def test_from_visit_to_visit_begins_and_ends_with_them(place, way, blend):
         ends = [picture.float() for picture in (both[0], both[-1])]
         assert torch.equal(both[0], both[1]) and torch.equal(both[-1], both[-2]), "each is seen for a moment"
         if blend == "fade":
-            part = (both[4].float() - ends[0]) @ torch.ones(3) / ((ends[1] - ends[0]) @ torch.ones(3))
-            seen = part[(ends[1] - ends[0]).abs().amin(-1) > 20]
+            way_there = ends[1] - ends[0]
+            part = ((both[4].float() - ends[0]) * way_there).sum(-1) / way_there.square().sum(-1)
+            seen = part[way_there.abs().amin(-1) > 20]
             assert len(seen) and 0.3 < seen.median() < 0.9
         else:
             line = (both[4] == 255).all(-1).all(0).nonzero()[:, 0]
