@@ -12,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from refield.field.descent import NETWORKS
 from refield.field.encoding import geometric_levels
 from refield.field.fit import FitConfig
 from refield.field.kernels import reference
@@ -458,8 +457,8 @@ def test_graphed_step_is_the_fits() -> None:
         found = reference.train_step(batch, space, twin.sampler.grid, (0.0, 8.0, 0.3), field, step.aim, into)
         assert int(step.samples) == len(found.cells) < step.capacity
         assert float(step.loss) == pytest.approx(found.loss, rel=2e-3)
-        for k, parts in enumerate(zip(learnt, into, first, second)):
-            reference.adam(*parts, 1e-2 * (NETWORKS if k else 1), count)
+        for w, *rest in zip(learnt, into, first, second):
+            reference.adam(w, *rest, 1e-2, count)
         reference.observe(state, count, 0.8, found.cells, found.weights, found.sigmas)
     for fast, truth, begin in zip([model.encoding.tables, *model.networks], learnt, start_of(2)):
         # the sign of a gradient that is zero but for rounding decides about a whole step

@@ -12,9 +12,6 @@ from refield.field.nerfacto import NerfactoField
 from refield.field.radiance import HashField
 
 MOST_SKIPPED = 20  # steps in a row
-NETWORKS = 0.5
-"""of the tables' learning rate. At all of it the colours of what is dark may run to black, where their slope vanishes,
-and stay there"""
 
 
 class NonFiniteError(RuntimeError):
@@ -32,7 +29,7 @@ FADE_EVERY = 16  # steps: to go through the whole of large tables costs as much 
 class TableAdam:
     """Adam for a hash field: what has no gradient rests, in the tables as in the matrices."""
 
-    def __init__(self, model: HashField, decay: float = 0.0, networks: float = NETWORKS) -> None:
+    def __init__(self, model: HashField, decay: float = 0.0, networks: float = 1.0) -> None:
         """``decay``: see `fading`; ``networks``: their learning rate, as a part of the tables'."""
         self.decay, self.networks = decay, networks
         self.parameters = [model.encoding.tables, *model.networks]

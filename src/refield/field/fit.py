@@ -44,12 +44,11 @@ class FitConfig:
     samples_per_ray: float = 40
     """the lattice along the ray is made coarser, up to 1.5 times, while a ray needs more than this"""
     rate: float = 2e-2
-    """Adam's learning rate, held for the first half, then brought down to a thirtieth; half of it in the networks"""
+    """Adam's learning rate, held for the first half, then brought down to a thirtieth"""
     decay: float | None = None
     """of the tables' entries, times the learning rate; by default as the quality says, none without one"""
     distortion: float = 1e-2
-    """weight of the distortion loss; without it fog fills the grid. Of photos that are dimmer than mid-grey less, by
-    how much their colours' squares are less: so much less is all that is wrong with them"""
+    """weight of the distortion loss; without it fog fills the grid"""
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera"""  # §10.1
     directions: bool = True
@@ -274,7 +273,6 @@ class _Fit:
         self.goes_on = goes_on
         self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
         self.taught, self.pixels, self.judge = photos, photos.bank(), photos.judge()
-        self.distortion = config.distortion * self.pixels.brightness
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model, config.decay or 0.0)
         if not config.directions:
@@ -350,7 +348,7 @@ class _Fit:
         asked = self.photos.ask(self.taught.drawn(self.pixels, n), progress)
         model, sampler = self.model, self.model.sampler
         space = (sampler.contraction.centre, sampler.contraction.radius)
-        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP)
+        aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
         where = (space, sampler.grid, sampler.lattice)
         done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, fine=sampler.fine)

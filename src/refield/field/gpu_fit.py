@@ -94,9 +94,7 @@ class _GpuFit:
         self.model, self.config = model, config
         device = model.encoding.tables.device
         with torch.device("cpu"):  # photos are read and posed there
-            bank = photos.bank()
-            self.distortion = config.distortion * bank.brightness
-            self.pixels = DevicePixels(bank, device)
+            self.pixels = DevicePixels(photos.bank(), device)
             self.judge = photos.judge()
         self.judge.move(device)
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
@@ -166,7 +164,7 @@ class _GpuFit:
         sampler = replace(self.model.sampler, step=self.finest_step * self.coarseness)
         self.model.sampler = sampler
         space = (sampler.contraction.centre, sampler.contraction.radius)
-        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP)
+        aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
         where = (space, self.grid, sampler.lattice, self.model.encoding.resolutions)
         occupancy = (self.occupancy.state, DECAY)
         graph = GraphedStep(self.descent, self.photos, where, aim, occupancy, (self.rays_per_step, self.capacity))

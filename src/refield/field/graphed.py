@@ -11,7 +11,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from refield.field.descent import NETWORKS
 from refield.field.kernels import gpu
 from refield.field.kernels.reference import Aim, Lattice, Space, Stepped
 from refield.field.photo_model import Asked, PhotoModel
@@ -106,9 +105,8 @@ class Descent:
         for grad in self._grads:
             grad.masked_fill_(~good, 0)  # what has no gradient rests
         scale = gpu.adam_scale(self.rate, self.count.clamp_min(1), self.tables.device)
-        scales = [scale, *(NETWORKS * scale for _ in self.networks)]
-        for parts in zip(self._parameters, self.into, self._first, self._second, scales):
-            gpu.descend(*parts)
+        for parts in zip(self._parameters, self.into, self._first, self._second):
+            gpu.descend(*parts, scale)
         return good
 
 

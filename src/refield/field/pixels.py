@@ -17,8 +17,6 @@ from refield.scene.images import frame_image
 DIRECTIONS_MOST = 1 << 29  # bytes; camera-space directions are kept for every pixel of every distinct camera up to here
 
 _TABLE_MOST = 64  # directions in the tables for each pixel of the bank
-_ASKED = 1 << 20  # pixels, of which more say nothing new about how bright they are
-_MID_GREY = 0.46  # sRGB of what throws back 18 % of the light
 
 
 class Pixels(Protocol):
@@ -81,13 +79,6 @@ class PixelBank:
 
     def __len__(self) -> int:
         return int(self.starts[-1])
-
-    @property
-    def brightness(self) -> float:
-        """The mean square of its colours beside that of mid-grey, at which cameras aim; at most 1. Of some of the
-        pixels, spread over all."""
-        some = self.rgb[:: max(len(self) // _ASKED, 1)].float() / 255
-        return min(float(some.square().mean()) / _MID_GREY**2, 1.0)
 
     def frame_of(self, pixels: Tensor) -> Tensor:
         """Index of the frame that owns each pixel, (B,) -> (B,)."""

@@ -29,7 +29,7 @@ from refield.update.unseen import Sight
 
 _RAYS = 1024, 8192  # of a step, at least and at most
 _NEW = 0.5  # of a step's rays from the new photos: they alone show what arrived, and are few beside the old
-_NETWORKS = 0.25  # of the tables' learning rate: less than in a whole fit, whose many steps bring black colours back
+_NETWORKS = 0.25  # of the tables' learning rate; at all of it, colours of what is dark may run to black, and stay so
 _PER_RAY = 0.5  # samples of a ray, at least, when rays are counted out for a step
 
 
