@@ -99,3 +99,16 @@ def test_entries_fade_that_no_ray_asks_for() -> None:
 
     assert torch.equal(after(0.0), torch.full_like(after(0.0), 0.5))
     torch.testing.assert_close(after(1.0), torch.full_like(after(0.0), 0.5 * fading(1.0, 1e-2) ** 2))
+
+
+@pytest.mark.parametrize("part", [1.0, 0.25])
+def test_networks_learn_at_a_part_of_the_tables_rate(part: float) -> None:
+    model = HashField(HashFieldConfig(levels=4, log2_table=8), Shell(1.0).sampler, 0)
+    adam = TableAdam(model, networks=part)
+    before = [p.detach().clone() for p in adam.parameters]
+    for grad in adam.grads:
+        grad.fill_(1.0)
+    assert adam.step(1e-2, 1.0)
+    for k, (was, now) in enumerate(zip(before, adam.parameters)):
+        wanted = torch.full_like(was, 1e-2 * (part if k else 1))
+        torch.testing.assert_close(was - now.detach(), wanted, rtol=1e-3, atol=1e-6)
