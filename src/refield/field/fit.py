@@ -44,11 +44,13 @@ class FitConfig:
     samples_per_ray: float = 40
     """the lattice along the ray is made coarser, up to 1.5 times, while a ray needs more than this"""
     rate: float = 2e-2
-    """Adam's learning rate, held for the first half, then brought down to a thirtieth"""
+    """Adam's learning rate, held for the first half, then brought down to a thirtieth; of dim photos in the networks
+    times `PixelBank.brightness`, lest their colours run to black and stay so"""
     decay: float | None = None
     """of the tables' entries, times the learning rate; by default as the quality says, none without one"""
     distortion: float = 1e-2
-    """weight of the distortion loss; without it fog fills the grid"""
+    """weight of the distortion loss; without it fog fills the grid. Of dim photos less, as their squared errors
+    of colour are: times the square of `PixelBank.brightness`"""
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera"""  # §10.1
     directions: bool = True
@@ -273,8 +275,10 @@ class _Fit:
         self.goes_on = goes_on
         self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
         self.taught, self.pixels, self.judge = photos, photos.bank(), photos.judge()
+        brightness = self.pixels.brightness
+        self.distortion = config.distortion * brightness**2  # errors of colour are as much less
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
-        self.adam = TableAdam(model, config.decay or 0.0)
+        self.adam = TableAdam(model, config.decay or 0.0, networks=brightness)
         if not config.directions:
             self.adam.parameters[COLOUR_IN].detach()[:, -DIRECTED:] = 0
         self.plain = not self.adam.parameters[COLOUR_IN][:, -DIRECTED:].any()
@@ -348,7 +352,7 @@ class _Fit:
         asked = self.photos.ask(self.taught.drawn(self.pixels, n), progress)
         model, sampler = self.model, self.model.sampler
         space = (sampler.contraction.centre, sampler.contraction.radius)
-        aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
+        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP)
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
         where = (space, sampler.grid, sampler.lattice)
         done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, fine=sampler.fine)

@@ -94,14 +94,18 @@ class _GpuFit:
         self.model, self.config = model, config
         device = model.encoding.tables.device
         with torch.device("cpu"):  # photos are read and posed there
-            self.pixels = DevicePixels(photos.bank(), device)
+            bank = photos.bank()
+            brightness = bank.brightness
+            self.distortion = config.distortion * brightness**2  # as `fit._Fit`
+            self.pixels = DevicePixels(bank, device)
+            del bank  # large
             self.judge = photos.judge()
         self.judge.move(device)
         self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.occupancy = OccupancyTrainer(model, allowed=allowed, outside=outside, beside=near if outside else None)
         model.looking_where(allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.grid = model.sampler.grid.clone()  # the one that graphs read
-        self.descent = Descent(model)
+        self.descent = Descent(model, networks=brightness)
         self.plain = not self.descent.networks[COLOUR_IN - 1][:, -DIRECTED:].any()
         self.capacity = config.samples * _BATCH
         self.rays_per_step, self.coarseness = _SIZES[0], COARSEST
@@ -164,7 +168,7 @@ class _GpuFit:
         sampler = replace(self.model.sampler, step=self.finest_step * self.coarseness)
         self.model.sampler = sampler
         space = (sampler.contraction.centre, sampler.contraction.radius)
-        aim = Aim(self.config.distortion, self.config.gradient_unit * space[1], STOP)
+        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP)
         where = (space, self.grid, sampler.lattice, self.model.encoding.resolutions)
         occupancy = (self.occupancy.state, DECAY)
         graph = GraphedStep(self.descent, self.photos, where, aim, occupancy, (self.rays_per_step, self.capacity))

@@ -81,8 +81,10 @@ class Descent:
     A step whose loss or gradient is not finite leaves everything as it was; ``bad`` counts such steps in a row.
     """
 
-    def __init__(self, model: HashField) -> None:
+    def __init__(self, model: HashField, networks: float = 1.0) -> None:
+        """``networks``: their learning rate, as a part of the tables'."""
         self.tables, self.networks = model.encoding.tables, model.networks
+        self._slower = networks
         self._parameters = [self.tables, *self.networks]
         device = self.tables.device
         self.rate = torch.zeros((), device=device)
@@ -105,8 +107,9 @@ class Descent:
         for grad in self._grads:
             grad.masked_fill_(~good, 0)  # what has no gradient rests
         scale = gpu.adam_scale(self.rate, self.count.clamp_min(1), self.tables.device)
-        for parts in zip(self._parameters, self.into, self._first, self._second):
-            gpu.descend(*parts, scale)
+        scales = [scale, *[self._slower * scale] * len(self.networks)]
+        for parts in zip(self._parameters, self.into, self._first, self._second, scales):
+            gpu.descend(*parts)
         return good
 
 

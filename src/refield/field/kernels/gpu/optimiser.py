@@ -41,7 +41,7 @@ def adam_scale(rate: float | Tensor, step: int | Tensor, device: torch.device) -
 
 
 def descend(param: Tensor, grad: Tensor, first: Tensor, second: Tensor, scale: Tensor) -> None:
-    """:func:`adam` with the scale found before: it is the same for everything that is learnt."""
+    """:func:`adam` with the scale found before: it is the same for all that learns at one rate."""
     n = param.numel()
     _adam[(triton.cdiv(n, _BLOCK),)](param.detach(), grad, first, second, scale, n, BLOCK=_BLOCK)
 
