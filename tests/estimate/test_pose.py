@@ -13,7 +13,7 @@ from refield.estimate import recipe
 from refield.estimate.alone import object_alone
 from refield.estimate.associate import take_off
 from refield.estimate.conclude import _shown_in
-from refield.estimate.detail import detail_of
+from refield.estimate.detail import detail_of, looking_alike
 from refield.estimate.explain import explained_before
 from refield.estimate.faces import changed_parts
 from refield.estimate.fit import is_sunk, trimmed
@@ -331,14 +331,17 @@ def test_detail_of_old_photos_is_what_the_field_lacks(stage):
     """The field paints the crate without a pattern: what it lacks is the pattern."""
     plain = BoxWorld((replace(CRATE, paint=-1),))
     views = [p.view for p in stage.past]
-    detail = detail_of(plain, stage.old, stage.capture.frames, views, TRUE, 3, 80_000)
-    assert 4 <= len(detail.patches) <= 12
+    frames = looking_alike(stage.old, stage.capture.frames, views, TRUE, 3)
+    assert 4 <= len(frames) <= 12
+    detail = detail_of(plain, stage.old, frames, 80_000)
+    assert len(detail.patches) == len(frames)
     top = torch.from_numpy(stage.old.cloud.points[stage.old.cloud.normals[:, 2] > 0.9])
     eye = torch.from_numpy(stage.old.centre) + torch.tensor([0.6, 0.2, 1.5])
     lacks, true = detail.at(top, eye), CRATE.colour(top)
     lacks, true = lacks - lacks.mean(0), true - true.mean(0)
     assert float((lacks * true).sum() / (lacks.norm() * true.norm())) > 0.8
-    assert detail_of(plain, stage.old, [], views, TRUE, 3, 80_000).patches == ()
+    assert looking_alike(stage.old, [], views, TRUE, 3) == []
+    assert detail_of(plain, stage.old, [], 80_000).patches == ()
 
 
 def test_an_object_that_moved_before_is_looked_up_where_it_first_was(stage):

@@ -62,27 +62,31 @@ def _looked_up(missing: Array, patch: Patch, x: Tensor) -> Tensor:
     return functional.grid_sample(image, at, padding_mode="border", align_corners=False)[0, :, :, 0].T
 
 
-def detail_of(
-    field: Field, old: Old, frames: Sequence[Frame], views: Sequence[View], new_from_old: Tensor, each: int, rays: int
-) -> Detail:
-    """The detail that ``views`` (new photos) need of an object that ``new_from_old`` moves.
-
-    Args:
-        frames: old photos, of which ``each`` new one takes so many.
-        rays: looked along in all; more are avoided by scaling the photos down.
-    """
+def looking_alike(
+    old: Old, frames: Sequence[Frame], views: Sequence[View], new_from_old: Tensor, each: int
+) -> list[Frame]:
+    """Those of some old photos that looked at an object most as new ones do where ``new_from_old`` moves it: ``each``
+    of the new ones takes so many."""
     middle = torch.from_numpy(old.centre).double()
     corners = corners_of(*old.grid.tight_aabb().numpy())
     frames = [f for f in frames if box_in(f.camera, f, corners) is not None]
     if not frames:
-        return Detail((), ())
+        return []
     ways = functional.normalize(torch.stack([f.centre for f in frames]).double() - middle, dim=-1)
     chosen: set[int] = set()
     for view in views:
         eye = transform(invert(new_from_old), view.frame.centre.double())
         alike = ways @ functional.normalize(eye - middle, dim=-1)
         chosen.update(alike.topk(min(each, len(frames))).indices.tolist())
-    patches = look_around(field, [frames[k] for k in sorted(chosen)], corners, rays)
+    return [frames[k] for k in sorted(chosen)]
+
+
+def detail_of(field: Field, old: Old, frames: Sequence[Frame], rays: int) -> Detail:
+    """The detail of an object in some old photos.
+
+    ``rays``: looked along in all; more are avoided by scaling the photos down.
+    """
+    patches = look_around(field, frames, corners_of(*old.grid.tight_aabb().numpy()), rays)
     return Detail(tuple(patches), tuple(_missing(p) for p in patches))
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from refield.estimate.arrive import shadow_of
 from refield.estimate.comoving import with_comoving
-from refield.estimate.detail import Detail, detail_of
+from refield.estimate.detail import Detail, detail_of, looking_alike
 from refield.estimate.explain import explained_before
 from refield.estimate.ground import Ground
 from refield.estimate.hull import votes
@@ -304,7 +304,8 @@ def _detail(ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor
     if fine.detail == 0 or not ground.photographed:
         return None
     rays = shared_out(fine.detail_rays, len(views))
-    return detail_of(ground.field, old, ground.photographed, views, new_from_old, fine.detail, rays)
+    frames = looking_alike(old, ground.photographed, views, new_from_old, fine.detail)
+    return ground.details.get((old, *frames), lambda: detail_of(ground.field, old, frames, rays))
 
 
 def shown_right(ground: Ground, old: Old, past: Sequence[Past]) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from refield.estimate.alone import object_alone
+from refield.estimate.detail import Detail
 from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.hull import Hull, HullConfig
 from refield.estimate.kept import Kept
@@ -86,6 +87,9 @@ class Ground:
     matcher: Matcher
     pasts: Kept[list[Past]] = dataclasses.field(init=False, default_factory=lambda: Kept(24))
     """the photos past some objects"""
+    details: Kept[Detail] = dataclasses.field(init=False, default_factory=lambda: Kept(16))
+    """what the field lacks of an object, by the old photos that are asked; as finely for all, since as many new photos
+    ask"""
     alone: Kept[Seen] = dataclasses.field(init=False, default_factory=lambda: Kept(128))
     """a moved object's own picture in a photo"""
 

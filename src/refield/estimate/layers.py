@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from torch import Tensor
 from refield.estimate.alone import object_alone, sampler_around
 from refield.estimate.detail import Detail
 from refield.estimate.explain import Compared
+from refield.estimate.kept import Kept
 from refield.estimate.look import Array, Hidden, Seen, pixel_slopes, see
 from refield.estimate.objects import Old, box_in, patch_rays
 from refield.estimate.past import Past
@@ -27,7 +28,6 @@ from refield.field.radiance import Field
 from refield.field.sampling import OccupancySampler
 from refield.scene.camera import Camera
 from refield.scene.capture import Rays
-from refield.scene.images import scaled_image
 from refield.scene.pose import exp, invert, rigid, skew, transform
 
 _MARGIN = 5  # pixels around the object that are compared too
@@ -167,6 +167,14 @@ class Layers:
 
     def show(self, new_from_old: Tensor) -> list[Layer]:
         """The moved object over the fixed background, per crop (Eqs. 1, 3)."""
+        return self._shown.get((new_from_old,), partial(self._show, new_from_old))
+
+    @cached_property
+    def _shown(self) -> Kept[list[Layer]]:
+        """The pose that is improved, and those that are tried beside it."""
+        return Kept(4)
+
+    def _show(self, new_from_old: Tensor) -> list[Layer]:
         alone = object_alone(self.sight.field, self.old, self._rays, new_from_old, self._sampler)
         behind, beyond = self._behind
         hidden = self._placed < alone.depth
@@ -266,8 +274,7 @@ def layers_at(sight: Sight, start: Tensor, rays: int) -> Layers:
 
 def _crop(index: int, p: Past, camera: Camera, box: tuple[int, int, int, int]) -> Crop:
     x0, y0, x1, y1 = box
-    fit = p.view.colour_fit
-    photo = np.clip(scaled_image(p.view.frame, camera).numpy()[y0:y1, x0:x1] * fit[0] + fit[1], 0, 1).astype(np.float32)
+    photo = p.view.photo_at(camera, box)
     h, w = p.view.shape
     rows = ((np.arange(y0, y1) + 0.5) * h / camera.height).astype(int)
     cols = ((np.arange(x0, x1) + 0.5) * w / camera.width).astype(int)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from refield.field.warp import crosses, outline
 from refield.scene.camera import Camera
 from refield.scene.capture import Frame, Rays, camera_rays
 from refield.scene.change import OccupancyGrid
-from refield.scene.images import scaled_image
+from refield.scene.images import frame_image, scaled_image
 from refield.vision import pixels
 
 Array = NDArray[Any]
@@ -245,6 +246,20 @@ class View:
         """World point under each pixel, (H, W, 3); not finite where the field is empty."""
         with np.errstate(invalid="ignore"):
             return self.centre + self.directions * self.depth[..., None]
+
+    @cached_property
+    def _taken(self) -> Array:
+        """The photo as its frame has it, (H, W, 3) uint8."""
+        return frame_image(self.frame).numpy()
+
+    def photo_at(self, camera: Camera, box: tuple[int, int, int, int]) -> Array:
+        """A rectangle (x0, y0, x1, y1) of the photo as ``camera``, the frame's own scaled down, would take it,
+        (h, w, 3); its colours as `photo` has them."""
+        photo, (x0, y0, x1, y1) = self._taken, box
+        if photo.shape[:2] != (camera.height, camera.width):
+            photo = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        gain, offset = self.colour_fit
+        return np.clip(photo[y0:y1, x0:x1].astype(np.float32) / 255 * gain + offset, 0, 1).astype(np.float32)
 
     @cached_property
     def pixel_angle(self) -> float:

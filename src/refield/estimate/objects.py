@@ -43,11 +43,11 @@ class Patch:
     def centre(self) -> Array:
         return self.frame.world_from_cam[:3, 3].numpy().astype(np.float32)
 
-    @property
+    @cached_property
     def rays(self) -> Rays:
         return patch_rays(self.camera, self.frame, self.box)
 
-    @property
+    @cached_property
     def points(self) -> Array:
         """World points (h, w, 3) on the surface."""
         d = self.rays.directions.numpy().reshape(*self.depth.shape, 3)

@@ -189,13 +189,13 @@ def refine(
         ready = layers_at(sight, pose, shared_out(rays, len(sight.past)))
         if not ready.crops:
             return None
-        pose, hessian = _descend(ready, pose, (sigma, steps), unit, config)
-    return _described(ready, pose, hessian, unit, (sigma, config))
+        pose, now = _descend(ready, pose, (sigma, steps), unit, config)
+    return _described(ready, pose, now, unit, config)
 
 
 def _descend(
     ready: Layers, pose: Tensor, level: tuple[float, int], unit: Tensor, c: RefineConfig
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Linear]:
     """Damped Gauss–Newton at one level; in units in which a turn and a shift move the surface alike."""
     sigma, steps = level
     damping = 1e-3
@@ -218,7 +218,7 @@ def _descend(
             damping = max(damping, 1e-2) * 8
         if not better or float(step.norm()) < 0.01 * ready.pixel:
             break
-    return pose, now.normal(c.robust, unit)[0]
+    return pose, now
 
 
 def _blurred(images: Tensor, shape: tuple[int, int], sigma: float) -> Tensor:
@@ -235,12 +235,9 @@ def _variance(ready: Layers, at: Linear, c: RefineConfig) -> float:
     return shared * (variance + _SURE**2)
 
 
-def _described(
-    ready: Layers, pose: Tensor, hessian: Tensor, unit: Tensor, level: tuple[float, RefineConfig]
-) -> PoseChange:
+def _described(ready: Layers, pose: Tensor, now: Linear, unit: Tensor, c: RefineConfig) -> PoseChange:
     """Covariance, what cannot be seen, and how much the composite explains."""
-    sigma, c = level
-    now = residuals(ready, pose, sigma, c)
+    hessian, _ = now.normal(c.robust, unit)
     size = (now.error**2).sum(-1).sqrt()[now.weight > 0.5]
     noise = (float(size.median()) if len(size) else 1.0) * 1.2 + _SURE
     values, vectors = torch.linalg.eigh(hessian)

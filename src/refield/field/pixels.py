@@ -18,6 +18,7 @@ DIRECTIONS_MOST = 1 << 29  # bytes; camera-space directions are kept for every p
 
 _TABLE_MOST = 64  # directions in the tables for each pixel of the bank
 _ASKED = 1 << 20  # pixels, of which more say nothing new about how bright they are
+_DIMMEST = 0.1  # 8 bits tell few colours of what is dimmer, and a fit would hardly begin
 _DIM = 0.36  # of the colours; of the worlds and photographs that the fit was made on, the dimmest have 0.38
 
 
@@ -84,11 +85,11 @@ class PixelBank:
 
     @property
     def brightness(self) -> float:
-        """The root mean square of its colours over that of what is barely dim, at most 1; of some of the pixels, spread
+        """The root mean square of its colours over that of what is barely dim, 0.1 to 1; of some of the pixels, spread
         over all, but for those that are black: of cut-out pictures nothing is there."""
         some = self.rgb[:: max(len(self) // _ASKED, 1) | 1].float() / 255
         lit = some[some.amax(-1) > 0]
-        return min(float(lit.square().mean()) ** 0.5 / _DIM, 1.0) if len(lit) else 1.0
+        return min(max(float(lit.square().mean()) ** 0.5 / _DIM, _DIMMEST), 1.0) if len(lit) else 1.0
 
     def frame_of(self, pixels: Tensor) -> Tensor:
         """Index of the frame that owns each pixel, (B,) -> (B,)."""
