@@ -122,7 +122,7 @@ def test_brightness_is_told_beside_what_is_barely_dim(tmp_path: Path) -> None:
         pose = torch.eye(4, dtype=torch.float64)
         return PixelBank([Frame(tmp_path / f"{grey}.png", CAMERA, "grey", pose)]).brightness
 
-    assert of(46) == pytest.approx(0.5, abs=0.01) and of(1) == 0.1 and of(0) == of(92) == of(255) == 1
+    assert of(38) == pytest.approx(0.5, abs=0.01) and of(1) == 0.1 and of(0) == of(92) == of(255) == 1
 
 
 def test_held_out_views_are_explained(capture: Capture, fitted: tuple[HashField, list[FitProgress]]) -> None:
