@@ -106,15 +106,14 @@ def test_shorter_samples_are_nearer_to_the_mean_over_where_samples_lie(
 def test_dim_photos_are_fitted_nearly_as_well(
     capture: Capture, fitted: tuple[HashField, list[FitProgress]], tmp_path: Path
 ) -> None:
-    """In proportion to their colours: with three seeds 1.5 to 2.2 dB less well, where a distortion loss that does not
-    heed them costs 9."""
+    """In proportion to their colours; with a distortion loss that does not heed them, 9 dB less well."""
     part = 0.3
     for frame in capture.frames:
         Image.fromarray((frame_image(frame).numpy() * part).round().astype(np.uint8)).save(tmp_path / frame.name)
     dim = Capture(tuple(replace(f, path=tmp_path / f.name) for f in capture.frames))
     looks: list[FitProgress] = []
     fit_field(dim, TINY, looks.append)
-    assert looks[-1].psnr + 20 * math.log10(part) > fitted[1][-1].psnr - 3
+    assert looks[-1].psnr + 20 * math.log10(part) > fitted[1][-1].psnr - 1.5
 
 
 def test_brightness_is_told_beside_what_is_barely_dim(tmp_path: Path) -> None:
@@ -123,7 +122,7 @@ def test_brightness_is_told_beside_what_is_barely_dim(tmp_path: Path) -> None:
         pose = torch.eye(4, dtype=torch.float64)
         return PixelBank([Frame(tmp_path / f"{grey}.png", CAMERA, "grey", pose)]).brightness
 
-    assert of(38) == pytest.approx(0.5, abs=0.01) and of(1) == 0.1 and of(0) == of(92) == of(255) == 1
+    assert of(42) == pytest.approx(0.5, abs=0.01) and of(1) == 0.1 and of(0) == of(92) == of(255) == 1
 
 
 def test_held_out_views_are_explained(capture: Capture, fitted: tuple[HashField, list[FitProgress]]) -> None:

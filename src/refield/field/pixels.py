@@ -19,7 +19,7 @@ DIRECTIONS_MOST = 1 << 29  # bytes; camera-space directions are kept for every p
 _TABLE_MOST = 64  # directions in the tables for each pixel of the bank
 _ASKED = 1 << 20  # pixels, of which more say nothing new about how bright they are
 _DIMMEST = 0.1  # 8 bits tell few colours of what is dimmer, and a fit would hardly begin
-_DIM = 0.3  # rms of the colours; of the worlds and photographs that the fit was made on, the dimmest have 0.36
+_DIM = 0.33  # rms of the colours; of the worlds and photographs that the fit was made on, the dimmest have 0.36
 
 
 class Pixels(Protocol):
