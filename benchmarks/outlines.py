@@ -4,7 +4,7 @@
 
 Each SCENE is a folder of the gauntlet, with ``data/`` and ``work/``. For every object that truly moved or left: of all
 outlines the one whose pixels cover the object's best (IoU over the new photos' cameras, as the old field shows both),
-the same among the outlines and their halves, which are offered where an outline fits nowhere; and that of the best
+the same among the outlines and their halves, which are offered where no whole outline is certain; and that of the best
 outline, drawn anew as what went along by the object's true motion.
 """
 

@@ -25,7 +25,7 @@ from refield.estimate.matched import camera_from_object, matched_poses
 from refield.estimate.models import Models
 from refield.estimate.outline import ObjectConfig, remembered
 from refield.estimate.past import changed_share, gone_score, look_past
-from refield.estimate.pose_change import RefineConfig, refine, residuals
+from refield.estimate.pose_change import COARSEST, SIDE, RefineConfig, refine, residuals
 from refield.estimate.register import RegisterConfig, Target, register, super_fibonacci, turns_about
 from refield.estimate.settle import looks_gone
 from refield.field.render import render_camera
@@ -262,6 +262,25 @@ def test_the_outline_of_a_moved_object_is_whole_in_photos_larger_than_the_workin
         assert (ndimage.binary_fill_holes(mask.numpy()) == mask.numpy()).all(), k
 
 
+def test_each_side_of_an_outline_is_asked_by_itself(stage):
+    """Photos in which half of the object is of another colour do not show that half, and show the other."""
+    centres, old = stage.old.lattice.centres, stage.old
+    left = centres[..., 0] < old.centre[0]
+    one, other = (replace(old, voxels=old.voxels & half) for half in (left, ~left))
+    ready = layers_at(Sight(BEFORE, old, stage.past, [old]), TRUE, RefineConfig().rays[0])
+    painted = []
+    for crop, shown in zip(ready.crops, ready.show(TRUE)):
+        solid, x = ready.places(crop, shown, TRUE)
+        wrong = torch.zeros(len(crop.rays), dtype=torch.bool)
+        wrong[torch.from_numpy(solid)] = torch.from_numpy(x[:, 0] < old.centre[0])
+        painted.append(replace(crop, photo=torch.where(wrong[:, None], 1 - crop.photo, crop.photo)))
+    sigma = SIDE * ready.apparent
+    assert min(ready.explained_of(half, TRUE, sigma).part for half in (one, other)) > 0.7
+    ready = replace(ready, crops=painted)
+    told, rest = (ready.explained_of(half, TRUE, sigma) for half in (one, other))
+    assert told.part < 0.5 and rest.part > 0.7 and min(told.pixels, rest.pixels) > 100
+
+
 def test_what_would_reach_into_the_ground_is_cut_off(stage):
     z = stage.old.lattice.centres[..., 2]
     near = np.abs(stage.old.lattice.centres - stage.old.centre)[..., :2].max(-1) < 0.1
@@ -275,11 +294,11 @@ def test_what_would_reach_into_the_ground_is_cut_off(stage):
         fine=RefineConfig(),
     )
     sight = Sight(BEFORE, deeper, stage.past, [stage.old])
-    old, change = trimmed(ground, sight, refine(sight, TRUE))
+    old, change = trimmed(ground, sight, refine(sight, TRUE, levels=COARSEST))
     assert not (old.voxels & (z < 0)).any()
     assert (old.voxels & stage.old.voxels).sum() > 0.9 * stage.old.voxels.sum()
     assert error(change.new_from_old)[0] < 0.6
-    same, _ = trimmed(replace_planes(ground), sight, refine(sight, TRUE))
+    same, _ = trimmed(replace_planes(ground), sight, refine(sight, TRUE, levels=COARSEST))
     assert (same.voxels & (z < 0)).any()  # without the ground nothing denies it
 
 

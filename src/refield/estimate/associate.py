@@ -16,7 +16,7 @@ from torch import Tensor
 
 from refield.estimate.arrive import newcomers, remarkable
 from refield.estimate.detect import Changed
-from refield.estimate.fit import Fit, fit_again, fit_of, is_among, left_by
+from refield.estimate.fit import Fit, cut_of, fit_again, fit_of, is_among, is_certain, left_by
 from refield.estimate.ground import Ground
 from refield.estimate.matched import matched_poses
 from refield.estimate.objects import Old
@@ -98,16 +98,20 @@ def _place(
             some = [k for k, old in tried.items() if old.remembered == again and k not in moved and parts]
             tries = {
                 k: fit_again(ground, everyone, views, found[k])
-                or fit_of(ground, olds[k], everyone, views, (parts, left), guess(k))
+                or fit_of(ground, olds[k], everyone, views, parts, guess(k))
                 for k in some
             }
-            enough = {k: ground.believe.shown if k in cut else 0.0 for k in some}
-            fits |= {k: fit for k, fit in tries.items() if fit is not None and fit.change.explained >= enough[k]}
+            fits |= _believed(ground, tries, cut)
+            if left and not again and not any(is_certain(ground, fit) for fit in fits.values()):
+                # if any fits, only those that do: once they are off the photos nothing may be left that asks for a cut
+                for k in [k for k in some if k in fits or not fits]:
+                    tries[k] = cut_of(ground, olds[k], fits.get(k), everyone, views, left, guess(k)) or tries[k]
+                fits |= _believed(ground, tries, cut)
             for k, best in tries.items():
                 for fit in () if best is None else (best, *best.rivals):
                     if not is_among(fit.change, [f.change for f in found[k]], fit.old):
                         found[k].append(fit)
-            if any(fit.change.explained >= ground.believe.shown for fit in fits.values()):
+            if any(is_certain(ground, fit) for fit in fits.values()):
                 break
         if not fits:
             return moved, olds
@@ -119,6 +123,11 @@ def _place(
                 olds[another] = tried[another] = rest
                 cut.add(another)
             views = take_off(ground, views, olds[k], moved[k])
+
+
+def _believed(ground: Ground, tries: dict[int, Fit | None], cut: set[int]) -> dict[int, Fit]:
+    """What was found; what is left of an outline (``cut``) only if the photos show it for certain."""
+    return {k: fit for k, fit in tries.items() if fit is not None and (k not in cut or is_certain(ground, fit))}
 
 
 def _together(fits: dict[int, Fit], enough: float) -> list[int]:

@@ -15,7 +15,7 @@ from refield.scene.srgb import to_linear, to_srgb
 from refield.vision import pixels
 
 LIMIT = 1.5  # times the difference from which on a pixel counts as changed
-_FEWEST = 50  # pixels from which a share is told
+FEWEST = 50  # pixels from which a share is told
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def explained_before(pictures: Sequence[tuple[Array, Array, NDArray[np.bool_]]],
         if here.any():
             right += int((here & (pixels.colour_difference(photo, rendering, 1) < LIMIT * threshold)).sum())
             count += int(here.sum())
-    return right / count if count >= _FEWEST else 1.0
+    return right / count if count >= FEWEST else 1.0
 
 
 def relit(p: Compared, sigma: float) -> Array:

@@ -14,16 +14,16 @@ from torch import Tensor
 from refield.estimate.arrive import shadow_of
 from refield.estimate.comoving import with_comoving
 from refield.estimate.detail import Detail, detail_of, looking_alike
-from refield.estimate.explain import explained_before
+from refield.estimate.explain import FEWEST, explained_before
 from refield.estimate.ground import Ground
 from refield.estimate.hull import votes
 from refield.estimate.lattice import Body, Lattice, components, some_of
-from refield.estimate.layers import Sight
+from refield.estimate.layers import Sight, layers_at
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import FEWEST_POINTS, restricted
 from refield.estimate.past import Past, gone_score, silhouette
-from refield.estimate.pose_change import COARSEST, FINER, PoseChange, refine, shared_out
+from refield.estimate.pose_change import COARSEST, FINER, SIDE, PoseChange, refine, shared_out
 from refield.estimate.register import Candidate, Target, register
 from refield.estimate.split import halves
 from refield.scene.planes import Plane
@@ -58,28 +58,65 @@ def fit_of(
     old: Old,
     olds: Sequence[Old],
     past: Sequence[Past],
-    arrived: tuple[Sequence[Body], Sequence[Body]],
+    parts: Sequence[Body],
     extra: Sequence[Tensor],
 ) -> Fit | None:
-    """The better fit of the outlines that an object may have, or of a part of one that may hold several things.
+    """The better fit of the outlines that an object may have.
 
-    ``arrived``: the arrivals' components, and those that would be told as newcomers if nothing explained them: only
-    these are worth an outline cut in two.
+    ``parts``: the arrivals' components.
     """
-    (parts, newcomers_left), outlines = arrived, [old] if old.instead is None else [old, old.instead]
     fits: list[Fit] = []
-    for one in outlines:
+    for one in [old] if old.instead is None else [old, old.instead]:
         fit = best_fit(ground, one, olds, past, parts, extra)
-        fits += [fit] if fit is not None else []
-        if fit is not None and fit.change.explained >= ground.believe.shown:
+        if is_certain(ground, fit):
             return fit
+        fits += [fit] if fit is not None else []
     whole = max(fits, key=lambda f: f.change.explained, default=None)
-    if old.remembered:
+    if whole is None or old.remembered:
         return whole
-    found = [] if whole is None else [whole, _along(ground, whole, olds, past)]
-    if newcomers_left and not any(fit is not None and fit.change.explained >= ground.believe.shown for fit in found):
-        found.append(_part_of(ground, outlines[-1], olds, past, newcomers_left, extra))
-    return max((fit for fit in found if fit is not None), key=lambda f: f.change.net, default=None)
+    along = _along(ground, whole, olds, past)
+    return max((fit for fit in (whole, along) if fit is not None), key=lambda f: f.change.net)
+
+
+def is_certain(ground: Ground, fit: Fit | None) -> bool:
+    """Whether the photos show nearly all of an object where it was found."""
+    return fit is not None and fit.change.explained >= ground.believe.shown
+
+
+def cut_of(
+    ground: Ground,
+    old: Old,
+    whole: Fit | None,
+    olds: Sequence[Old],
+    past: Sequence[Past],
+    parts: Sequence[Body],
+    extra: Sequence[Tensor],
+) -> Fit | None:
+    """The fit of one of the two things that an outline may hold; None if neither is told better than the ``whole``.
+
+    Where the whole fits, but not for certain, it is asked first whether it does because one of two things is there.
+
+    ``parts``: the arrivals' components that would be told as newcomers if nothing explained them.
+    """
+    outline = old if old.instead is None else old.instead
+    pairs = halves(outline, ground.shape)
+    if not pairs or (whole is not None and not _shows_one_side(ground, whole, pairs[0], olds, past)):
+        return None
+    part = _part_of(ground, outline, pairs, olds, past, parts, extra)
+    return part if part is None or whole is None or part.change.net > whole.change.net else None
+
+
+def _shows_one_side(
+    ground: Ground, whole: Fit, sides: tuple[Old, Old], olds: Sequence[Old], past: Sequence[Past]
+) -> bool:
+    """Whether the photos show one of two sides of an outline for certain where the whole fits, and not the other: what
+    a field shows badly is explained as badly on either side."""
+    pose, rays = whole.change.new_from_old, shared_out(ground.fine.rays[-1], len(past))
+    sight = Sight(ground.field, whole.old, past, olds, _detail(ground, whole.old, past, pose))
+    ready = layers_at(sight, pose, rays)
+    told = [ready.explained_of(side, pose, SIDE * ready.apparent) for side in sides]
+    shares = [side.part for side in told]
+    return min(shares) < ground.believe.shown <= max(shares) and min(side.pixels for side in told) >= FEWEST
 
 
 def _along(ground: Ground, fit: Fit, olds: Sequence[Old], past: Sequence[Past]) -> Fit | None:
@@ -107,7 +144,7 @@ def fit_again(ground: Ground, olds: Sequence[Old], past: Sequence[Past], found: 
         fit = _refined(ground, f.old, olds, past, [f.change.new_from_old], f.score, ground.believe.gains)
         again += [replace(fit, rest=f.rest)] if fit is not None else []
     best = next(iter(_best_first(again)), None)
-    return best if best is not None and best.change.explained >= ground.believe.shown else None
+    return best if is_certain(ground, best) else None
 
 
 def is_among(change: PoseChange, others: Iterable[PoseChange], old: Old) -> bool:
@@ -125,6 +162,7 @@ def at_one_place(one: PoseChange, other: PoseChange, old: Old) -> bool:
 def _part_of(
     ground: Ground,
     old: Old,
+    pairs: Sequence[tuple[Old, Old]],
     olds: Sequence[Old],
     past: Sequence[Past],
     parts: Sequence[Body],
@@ -135,11 +173,10 @@ def _part_of(
     Any outline can be cut, and a piece fits more easily than a thing: one is believed if it or the whole left for
     certain, and the photos show nearly all of it where it is.
     """
-    pairs = halves(old, ground.shape)
     if left_by(ground, past, old) is None:
         pairs = [(half, other) for half, other in pairs if left_by(ground, past, half) is not None]
     fits = [(best_fit(ground, half, olds, past, parts, extra), other) for half, other in pairs]
-    found = [(fit, other) for fit, other in fits if fit is not None and fit.change.explained >= ground.believe.shown]
+    found = [(fit, other) for fit, other in fits if fit is not None and is_certain(ground, fit)]
     if not found:
         return None
     best, other = max(found, key=lambda f: f[0].change.net)
@@ -148,7 +185,7 @@ def _part_of(
         whole = _refined(ground, old, olds, past, pose, best.score, ground.believe.gains)
         if whole is not None:
             return whole
-    rivals = [f for f in best.rivals if f.change.explained >= ground.believe.shown]
+    rivals = [f for f in best.rivals if is_certain(ground, f)]
     return replace(best, rest=other, rivals=tuple(replace(f, rest=other) for f in rivals))
 
 
@@ -268,11 +305,13 @@ def _likely(ground: Ground, sight: Sight, poses: Sequence[Tensor], least: float 
 
 
 def _finished(ground: Ground, sight: Sight, rough: PoseChange) -> tuple[Old, PoseChange] | None:
-    """A pose refined to the end, with what old photos show of the object, and the object without what cannot be there;
-    None if no photo shows the place."""
-    sight = replace(sight, detail=_detail(ground, sight.old, sight.past, rough.new_from_old))
-    fine = refine(sight, rough.new_from_old, ground.fine, FINER)
-    return None if fine is None else trimmed(ground, sight, fine)
+    """A pose refined to the end, with what old photos show of the object, and the object without what cannot be at the
+    ``rough`` pose; None if no photo shows the place."""
+    old, rough = trimmed(ground, sight, rough)
+    # of the whole outline, so that poses at which other parts of it are cut off share it
+    detail = _detail(ground, sight.old, sight.past, rough.new_from_old)
+    fine = refine(replace(sight, old=old, detail=detail), rough.new_from_old, ground.fine, FINER)
+    return None if fine is None else (old, fine)
 
 
 def believed(ground: Ground, old: Old, past: Sequence[Past], change: PoseChange, gains: float | None = None) -> bool:
@@ -352,7 +391,7 @@ def trimmed(ground: Ground, sight: Sight, change: PoseChange) -> tuple[Old, Pose
     smaller = restricted(old, parts[0], ground.shape)
     if len(smaller.cloud.points) < FEWEST_POINTS:
         return old, change
-    again = refine(replace(sight, old=smaller), change.new_from_old, ground.fine)
+    again = refine(replace(sight, old=smaller), change.new_from_old, ground.fine, COARSEST)
     return (old, change) if again is None or again.explained <= change.explained - 0.02 else (smaller, again)
 
 

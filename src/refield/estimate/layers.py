@@ -7,7 +7,7 @@ that the layer slides over the image: a hash grid's own gradients oscillate, tho
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import cv2
@@ -19,8 +19,9 @@ from torch import Tensor
 
 from refield.estimate.alone import object_alone, sampler_around
 from refield.estimate.detail import Detail
-from refield.estimate.explain import Compared
+from refield.estimate.explain import Compared, Explained, explained
 from refield.estimate.kept import Kept
+from refield.estimate.lattice import grown
 from refield.estimate.look import Array, Hidden, Seen, pixel_slopes, see
 from refield.estimate.objects import Old, box_in, patch_rays
 from refield.estimate.past import Past
@@ -212,10 +213,25 @@ class Layers:
     def sides(self, crop: Crop, shown: Layer, new_from_old: Tensor) -> NDArray[np.int64]:
         """The side of the object at each pixel (n,); -1 where it is not, or no old photo saw what is there."""
         out = np.full(len(shown.depth), -1)
+        solid, x = self.places(crop, shown, new_from_old)
+        out[solid] = self.old.side_of(x)
+        return out
+
+    def places(self, crop: Crop, shown: Layer, new_from_old: Tensor) -> tuple[NDArray[np.bool_], Array]:
+        """Which pixels (n,) show the object, and the points (K, 3) of it, at its old place, that these show."""
         solid = (shown.opacity > 0.8) & torch.isfinite(shown.depth)
         x = crop.rays.origins[solid] + crop.rays.directions[solid] * shown.depth[solid, None]
-        out[solid.numpy()] = self.old.side_of(transform(invert(new_from_old), x).numpy())
-        return out
+        return solid.numpy(), transform(invert(new_from_old), x).numpy()
+
+    def explained_of(self, half: Old, new_from_old: Tensor, sigma: float) -> Explained:
+        """`explained`, asked only of those of the object's pixels that show ``half`` of it, in a light of their own."""
+        asked = []
+        for crop, shown, told in zip(self.crops, self.show(new_from_old), self.compared(new_from_old)):
+            mine = np.zeros(len(crop.rays), bool)
+            solid, x = self.places(crop, shown, new_from_old)
+            mine[solid] = half.lattice.holds(grown(half.voxels, 1), x)
+            asked.append(replace(told, sides=np.where(mine.reshape(crop.shape), told.sides, -1)))
+        return explained(asked, sigma)
 
     def compared(self, new_from_old: Tensor) -> list[Compared]:
         """What `explained` asks for, per crop."""
