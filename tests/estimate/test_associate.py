@@ -87,8 +87,8 @@ def test_what_is_known_from_earlier_is_never_cut(monkeypatch):
     ],
 )
 def test_an_outline_that_fits_is_cut_where_one_side_alone_is_shown(monkeypatch, told, one_alone):
-    sides = tuple(SimpleNamespace(told=t) for t in told)
-    ready = SimpleNamespace(apparent=10.0, explained_of=lambda side, *_: side.told)
+    sides = SimpleNamespace(), SimpleNamespace()
+    ready = SimpleNamespace(apparent=10.0, explained_of=lambda asked, *_: list(told))
     monkeypatch.setattr(fit, "layers_at", lambda *_: ready)
     monkeypatch.setattr(fit, "_detail", lambda *_: None)
     whole = Fit(0.1, SimpleNamespace(), SimpleNamespace(new_from_old=None))

@@ -275,9 +275,8 @@ def test_each_side_of_an_outline_is_asked_by_itself(stage):
         wrong[torch.from_numpy(solid)] = torch.from_numpy(x[:, 0] < old.centre[0])
         painted.append(replace(crop, photo=torch.where(wrong[:, None], 1 - crop.photo, crop.photo)))
     sigma = SIDE * ready.apparent
-    assert min(ready.explained_of(half, TRUE, sigma).part for half in (one, other)) > 0.7
-    ready = replace(ready, crops=painted)
-    told, rest = (ready.explained_of(half, TRUE, sigma) for half in (one, other))
+    assert min(half.part for half in ready.explained_of((one, other), TRUE, sigma)) > 0.7
+    told, rest = replace(ready, crops=painted).explained_of((one, other), TRUE, sigma)
     assert told.part < 0.5 and rest.part > 0.7 and min(told.pixels, rest.pixels) > 100
 
 

@@ -66,7 +66,7 @@ def fit_of(
     ``parts``: the arrivals' components.
     """
     fits: list[Fit] = []
-    for one in [old] if old.instead is None else [old, old.instead]:
+    for one in old.outlines:
         fit = best_fit(ground, one, olds, past, parts, extra)
         if is_certain(ground, fit):
             return fit
@@ -98,8 +98,10 @@ def cut_of(
 
     ``parts``: the arrivals' components that would be told as newcomers if nothing explained them.
     """
-    outline = old if old.instead is None else old.instead
+    outline = old.outlines[-1]
     pairs = halves(outline, ground.shape)
+    if left_by(ground, past, outline) is None:  # any outline can be cut: it or the half that is looked for is gone
+        pairs = [(half, other) for half, other in pairs if left_by(ground, past, half) is not None]
     if not pairs or (whole is not None and not _shows_one_side(ground, whole, pairs[0], olds, past)):
         return None
     part = _part_of(ground, outline, pairs, olds, past, parts, extra)
@@ -114,7 +116,7 @@ def _shows_one_side(
     pose, rays = whole.change.new_from_old, shared_out(ground.fine.rays[-1], len(past))
     sight = Sight(ground.field, whole.old, past, olds, _detail(ground, whole.old, past, pose))
     ready = layers_at(sight, pose, rays)
-    told = [ready.explained_of(side, pose, SIDE * ready.apparent) for side in sides]
+    told = ready.explained_of(sides, pose, SIDE * ready.apparent)
     shares = [side.part for side in told]
     return min(shares) < ground.believe.shown <= max(shares) and min(side.pixels for side in told) >= FEWEST
 
@@ -170,11 +172,10 @@ def _part_of(
 ) -> Fit | None:
     """The better fit of the two things that an outline may be; of the whole, if the other moved along.
 
-    Any outline can be cut, and a piece fits more easily than a thing: one is believed if it or the whole left for
-    certain, and the photos show nearly all of it where it is.
+    A piece fits more easily than a thing: one is believed if the photos show nearly all of it where it is.
+
+    ``pairs``: the halves that are looked for, each with the other.
     """
-    if left_by(ground, past, old) is None:
-        pairs = [(half, other) for half, other in pairs if left_by(ground, past, half) is not None]
     fits = [(best_fit(ground, half, olds, past, parts, extra), other) for half, other in pairs]
     found = [(fit, other) for fit, other in fits if fit is not None and is_certain(ground, fit)]
     if not found:

@@ -223,15 +223,20 @@ class Layers:
         x = crop.rays.origins[solid] + crop.rays.directions[solid] * shown.depth[solid, None]
         return solid.numpy(), transform(invert(new_from_old), x).numpy()
 
-    def explained_of(self, half: Old, new_from_old: Tensor, sigma: float) -> Explained:
-        """`explained`, asked only of those of the object's pixels that show ``half`` of it, in a light of their own."""
-        asked = []
-        for crop, shown, told in zip(self.crops, self.show(new_from_old), self.compared(new_from_old)):
-            mine = np.zeros(len(crop.rays), bool)
-            solid, x = self.places(crop, shown, new_from_old)
-            mine[solid] = half.lattice.holds(grown(half.voxels, 1), x)
-            asked.append(replace(told, sides=np.where(mine.reshape(crop.shape), told.sides, -1)))
-        return explained(asked, sigma)
+    def explained_of(self, parts: Sequence[Old], new_from_old: Tensor, sigma: float) -> list[Explained]:
+        """`explained`, asked of each of some parts of the object by itself: of the pixels alone that show it, in a
+        light of their own."""
+        told = self.compared(new_from_old)
+        seen = [self.places(crop, shown, new_from_old) for crop, shown in zip(self.crops, self.show(new_from_old))]
+        out = []
+        for part in parts:
+            asked, body = [], grown(part.voxels, 1)
+            for photo, (solid, x) in zip(told, seen):
+                mine = np.zeros(photo.sides.size, bool)
+                mine[solid] = part.lattice.holds(body, x)
+                asked.append(replace(photo, sides=np.where(mine.reshape(photo.sides.shape), photo.sides, -1)))
+            out.append(explained(asked, sigma))
+        return out
 
     def compared(self, new_from_old: Tensor) -> list[Compared]:
         """What `explained` asks for, per crop."""

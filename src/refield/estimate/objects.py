@@ -106,6 +106,11 @@ class Old:
     instead: Old | None = None
     """what it may be with its surroundings, where it cannot be told from them; what fits the new photos says which"""
 
+    @property
+    def outlines(self) -> tuple[Old, ...]:
+        """What it may be: itself, and with its surroundings."""
+        return (self,) if self.instead is None else (self, self.instead)
+
     @cached_property
     def centre(self) -> Array:
         return self.lattice.centres[self.voxels].mean(0)

@@ -264,7 +264,7 @@ class Search:
         came = [_box(body) for body in best.arrived]
         olds = {k: old for k, old in enumerate(best.olds) if k not in best.removed}
         some = {k: old for k, old in olds.items() if _beside(_box(Body(old.lattice, old.voxels)), came)}
-        asked = [(k, one) for k, old in some.items() for one in (old, old.instead) if one is not None]
+        asked = [(k, one) for k, old in some.items() for one in old.outlines]
         return asked + self._whole(some)
 
     def _slides(self, best: Settled, k: int, one: Old) -> Iterator[Settled]:
