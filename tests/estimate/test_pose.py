@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy import ndimage
 
-from refield.estimate import recipe
+from refield.estimate import recipe, turns
 from refield.estimate.alone import object_alone
 from refield.estimate.associate import take_off
 from refield.estimate.conclude import _shown_in
@@ -28,6 +28,7 @@ from refield.estimate.past import changed_share, gone_score, look_past
 from refield.estimate.pose_change import COARSEST, SIDE, RefineConfig, refine, residuals
 from refield.estimate.register import RegisterConfig, Target, register, super_fibonacci, turns_about
 from refield.estimate.settle import looks_gone
+from refield.estimate.turns import may_be_turned, turned
 from refield.field.render import render_camera
 from refield.field.source import Known
 from refield.scene.camera import Camera
@@ -123,6 +124,41 @@ def test_rotations_are_tried_also_where_no_turn_fits(stage):
         for k in (1, 2)
     )
     assert error(one)[0] > 45 and error(more)[0] < 1.0
+
+
+def turning(stage):
+    """What turns are asked on."""
+    return SimpleNamespace(
+        field=BEFORE,
+        photographed=[],
+        survey=stage.scene.survey,
+        planes=[],
+        believe=AssociateConfig(),
+        carving=HullConfig(),
+        shape=ObjectConfig(),
+        search=RegisterConfig(rotations=350),
+        fine=RefineConfig(),
+    )
+
+
+def test_all_turns_at_a_place_are_asked_what_they_explain(stage):
+    """Begun at the right place a hundred degrees off, whence no descent leads back."""
+    ground = turning(stage)
+    sight = Sight(BEFORE, stage.old, stage.past, [stage.old])
+    wrongly = refine(sight, turn(transform(TRUE, CRATE.world_from_box[:3, 3]), 100, (0.01, 0, 0)) @ TRUE)
+    found = turned(ground, sight, wrongly)
+    told = [change.explained for _, change in found]
+    assert error(wrongly.new_from_old)[0] > 45 and may_be_turned(ground, stage.old, stage.past, wrongly)
+    assert error(found[0][1].new_from_old)[0] < 1.5 and told[0] == max(told) > wrongly.explained + 0.1
+
+
+def test_the_best_turn_is_turned_on(stage):
+    """As far from the truth as the turns that are asked lie apart."""
+    ground = turning(stage)
+    sight = Sight(BEFORE, stage.old, stage.past, [stage.old])
+    near = turn(transform(TRUE, CRATE.world_from_box[:3, 3]), 14, (0, 0, 0)) @ TRUE
+    on = turns._turned_on(ground, sight, stage.old, replace(refine(sight, TRUE), new_from_old=near))
+    assert error(on.new_from_old)[0] < 1.5
 
 
 def test_a_place_may_be_known_of_another_point_than_the_middle(stage):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from refield.estimate import fit, recipe, settle
+from refield.estimate import fit, recipe, settle, turns
 from refield.estimate.lattice import Body, grown, some_of
 from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_of
@@ -209,9 +209,9 @@ def test_places_that_are_likely_at_first_are_each_refined_to_the_end(capture, tm
     near = [turn(middle, degrees, (0.004, 0, 0)) @ AWAY for degrees in (2, -2, 1)]
     sight = Sight(ground.field, old, views, [old])
     poses = [turn(middle, 180, (0, 0, 0)) @ AWAY, *near]
-    assert len(fit._likely(ground, sight, poses)) == 1  # the other is too far behind to become the better one
-    monkeypatch.setattr(fit, "_SHIFTS", 0.5)
-    places = fit._likely(ground, sight, poses)
+    assert len(fit.finest(ground, sight, poses)) == 1  # the other is too far behind to become the better one
+    monkeypatch.setattr(fit, "SHIFTS", 0.5)
+    places = fit.finest(ground, sight, poses)
     turned = [float(angle_between(change.new_from_old, AWAY)) for _, change in places]
     assert len(turned) == 2 and turned[0] < 1.5 and turned[1] > 90
 
@@ -228,6 +228,37 @@ def test_poses_that_the_photos_cannot_tell_apart_are_all_told(tmp_path):
     assert [float(angle_between(pose, AWAY)) for pose in poses] == pytest.approx([0, 180], abs=1.5)
     assert all(float((transform(pose, CENTRE) - transform(AWAY, CENTRE)).norm()) < 0.02 for pose in poses)
     assert "would look the same" in change.why
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_what_is_explained_less_than_it_is_shown_is_turned_right(shown, capture, tmp_path, monkeypatch):
+    """Found at its place and turned wrongly: unless old photos show no more of it than that, all turns are asked."""
+    _, (ground, (old,), changed, found) = settled(capture, tmp_path, monkeypatch)
+    (k,) = found.moved
+    wrongly = turn(transform(AWAY, CENTRE), 100, (0.01, 0, 0)) @ AWAY
+    search = settle.Search(ground, changed)
+    search.first[k] = old
+    at = settle.refine(Sight(ground.field, old, settle.without(ground, changed, [old]), [old]), wrongly, ground.fine)
+    begun, least = judged(ground, search._with(found, k, old, at))
+    if not shown:
+        monkeypatch.setattr(turns, "shown_right", lambda *_: at.explained)
+    told, left = search._turned_right(begun, least, k)
+    assert at.explained < 0.8 and float(angle_between(begun.moved[k].new_from_old, AWAY)) > 45
+    assert (float(angle_between(told.moved[k].new_from_old, AWAY)) < 2) is shown
+    assert (left < least) is shown and (told is begun) is not shown
+
+
+def test_a_turn_is_taken_only_for_more_than_it_leaves_unexplained(capture, tmp_path, monkeypatch):
+    _, (ground, (old,), changed, found) = settled(capture, tmp_path, monkeypatch)
+    ((k, change),) = found.moved.items()
+    asked = pixels_of(ground, found, k)
+    monkeypatch.setattr(settle, "may_be_turned", lambda *_: True)
+    monkeypatch.setattr(settle, "turned", lambda *_: [(old, replace(change, explained=1.0))])
+    for explained, more, taken in [(0.5, 0.4, True), (0.5, 0.6, False), (0.99, -1.0, False)]:
+        begun = replace(found, moved={k: replace(change, explained=explained)})
+        monkeypatch.setattr(settle, "judged", lambda _, one, more=more: (one, 100.0 + more * asked))
+        told, _ = settle.Search(ground, changed)._turned_right(begun, 100.0, k)
+        assert (told is not begun) is taken
 
 
 def test_an_object_is_put_where_its_thickest_part_fits_among_much_that_arrived(capture, tmp_path, monkeypatch):

@@ -32,9 +32,10 @@ from refield.vision import pixels
 
 ALIKE = 0.02
 """of an object's pixels; poses that explain more by less than this explain as much"""
+SHIFTS = 0.125
+"""of an object's pixels; what a pose explains changes by no more when it is refined to the end"""
 _HOLDS_MORE = 3.0  # times an object's volume; the hull of one object, carved by few photos, is about twice as large
 _FEW = 3  # poses that are refined to the end
-_SHIFTS = 0.125  # of an object's pixels; what a pose explains changes by no more when it is refined to the end
 _MOST_PLACES = 24  # that are tried in a component that holds several objects
 
 
@@ -114,7 +115,7 @@ def _shows_one_side(
     """Whether the photos show one of two sides of an outline for certain where the whole fits, and not the other: what
     a field shows badly is explained as badly on either side."""
     pose, rays = whole.change.new_from_old, shared_out(ground.fine.rays[-1], len(past))
-    sight = Sight(ground.field, whole.old, past, olds, _detail(ground, whole.old, past, pose))
+    sight = Sight(ground.field, whole.old, past, olds, detail_for(ground, whole.old, past, pose))
     ready = layers_at(sight, pose, rays)
     told = ready.explained_of(sides, pose, SIDE * ready.apparent)
     shares = [side.part for side in told]
@@ -238,7 +239,7 @@ def places_among(
     for target in (t for part in parts for t in targets_of(past, part, old)):
         found += register(old.cloud, past, target, ground.up, ground.search)
     found = sorted(found, key=lambda c: c.score)[: ground.believe.refined]
-    fine = _likely(ground, Sight(ground.field, old, past, olds), [c.new_from_old for c in found])
+    fine = finest(ground, Sight(ground.field, old, past, olds), [c.new_from_old for c in found])
     return [Fit(found[0].score, *one) for one in fine]
 
 
@@ -269,7 +270,7 @@ def _refined(
 
     ``gains``: the part of its pixels by which they must show more of it than of what was there.
     """
-    likely = _likely(ground, Sight(ground.field, old, past, olds), poses, _asked(ground, old, past))
+    likely = finest(ground, Sight(ground.field, old, past, olds), poses, _asked(ground, old, past))
     fits = _best_first(Fit(score, *found) for found in likely if believed(ground, found[0], past, found[1], gains))
     return replace(fits[0], rivals=tuple(fits[1:])) if fits else None
 
@@ -287,7 +288,7 @@ def _turn(change: PoseChange) -> float:
     return float(angle_between(change.new_from_old[:3, :3], torch.eye(3, dtype=torch.float64)))
 
 
-def _likely(ground: Ground, sight: Sight, poses: Sequence[Tensor], least: float = 0.0) -> list[tuple[Old, PoseChange]]:
+def finest(ground: Ground, sight: Sight, poses: Sequence[Tensor], least: float = 0.0) -> list[tuple[Old, PoseChange]]:
     """The few poses of an object that explain most, each another place, refined to the end: what looks much alike when
     it is turned is told apart by what is fine. None that could not be the best, nor explain ``least`` of its pixels."""
     rough = [refine(sight, pose, ground.fine, COARSEST) for pose in poses]
@@ -297,7 +298,7 @@ def _likely(ground: Ground, sight: Sight, poses: Sequence[Tensor], least: float 
             apart.append(change)
     out = list[tuple[Old, PoseChange]]()
     most = apart[0].explained if apart else 0.0
-    least = max(least, most - _SHIFTS) - _SHIFTS
+    least = max(least, most - SHIFTS) - SHIFTS
     for change in [c for c in apart[:_FEW] if c.explained >= least]:
         found = _finished(ground, sight, change)
         if found is not None and not is_among(found[1], [other for _, other in out], found[0]):
@@ -310,7 +311,7 @@ def _finished(ground: Ground, sight: Sight, rough: PoseChange) -> tuple[Old, Pos
     ``rough`` pose; None if no photo shows the place."""
     old, rough = trimmed(ground, sight, rough)
     # of the whole outline, so that poses at which other parts of it are cut off share it
-    detail = _detail(ground, sight.old, sight.past, rough.new_from_old)
+    detail = detail_for(ground, sight.old, sight.past, rough.new_from_old)
     fine = refine(replace(sight, old=old, detail=detail), rough.new_from_old, ground.fine, FINER)
     return None if fine is None else (old, fine)
 
@@ -339,7 +340,9 @@ def gains_enough(ground: Ground, change: PoseChange, gains: float | None = None)
     return change.explained >= change.before + gains * (2 if change.before > ground.believe.alike else 1)
 
 
-def _detail(ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor) -> Detail | None:
+def detail_for(ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor) -> Detail | None:
+    """What old photos show of an object that the field does not, as new ones see it at a pose; None if that is not
+    asked for."""
     fine, views = ground.fine, [p.view for p in past]
     if fine.detail == 0 or not ground.photographed:
         return None

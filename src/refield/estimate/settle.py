@@ -42,6 +42,7 @@ from refield.estimate.objects import Old
 from refield.estimate.outline import standing
 from refield.estimate.past import Past, changed_share
 from refield.estimate.pose_change import FINER, PoseChange, refine
+from refield.estimate.turns import may_be_turned, turned
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
@@ -69,6 +70,8 @@ class Search:
     """where what left may be among what arrived"""
     outlined: Kept[Old | None] = field(default_factory=Kept)
     """what went along with an object, by its motion"""
+    turns: Kept[list[tuple[Old, PoseChange]]] = field(default_factory=Kept)
+    """how an object may be turned where it is"""
     anew: dict[int, Old] = field(default_factory=dict)
     """what was outlined so, by its identity"""
 
@@ -91,7 +94,28 @@ class Search:
                     again, best, least, tried = True, other, tried[this], {}
         if begun is not None and judged(self.ground, begun)[1] <= least:
             return begun
+        for k in best.moved:
+            best, least = self._turned_right(best, least, k)
         return self._led(best, least, tried)
+
+    def _turned_right(self, best: Settled, least: float, k: int) -> tuple[Settled, float]:
+        """The best hypothesis with an object turned as the photos show more of it, if they show less than they might.
+
+        The number that hypotheses are compared by hardly knows the turn of what is small: it may not tell against it.
+        """
+        old, change = best.olds[k], best.moved[k]
+        gone, views = self._without(best, k, old)
+        if not may_be_turned(self.ground, old, views, change):
+            return best, least
+        sight = Sight(self.ground.field, old, views, gone)
+        found = [Fit(0.0, *one) for one in self.turns.get((old, change), partial(turned, self.ground, sight, change))]
+        self.fits[k] += found
+        more = max(found, key=lambda f: f.change.explained, default=None)
+        if more is None or more.change.explained < change.explained + ALIKE:
+            return best, least
+        other, left = judged(self.ground, self._with(best, k, more.old, more.change))
+        gained = (more.change.explained - change.explained) * pixels_of(self.ground, best, k)
+        return (other, left) if k in other.moved and left - least < gained else (best, least)
 
     def _led(self, best: Settled, least: float, tried: dict[_Which, float]) -> Settled:
         """The best hypothesis with how far it leads the other answers for each object that it tells of, and the poses
@@ -104,7 +128,8 @@ class Search:
             if tried.get(("turned", k, 0), math.inf) - least < ALIKE * asked:
                 apart: list[PoseChange] = []
                 for one in self._turned(best, k):
-                    alike = k in one.moved and judged(self.ground, one)[1] - least < ALIKE * asked
+                    alike = k in one.moved and one.moved[k].explained > best.moved[k].explained - ALIKE
+                    alike = alike and judged(self.ground, one)[1] - least < ALIKE * asked
                     if alike and not is_among(one.moved[k], (best.moved[k], *apart), best.olds[k]):
                         apart.append(one.moved[k])
                 twins[k] = tuple(apart)
