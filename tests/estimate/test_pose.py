@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy import ndimage
 
-from refield.estimate import recipe, turns
+from refield.estimate import recipe, rotations
 from refield.estimate.alone import object_alone
 from refield.estimate.associate import take_off
 from refield.estimate.conclude import _shown_in
@@ -19,16 +19,17 @@ from refield.estimate.faces import changed_parts
 from refield.estimate.fit import is_sunk, trimmed
 from refield.estimate.ground import AssociateConfig
 from refield.estimate.hull import HullConfig
+from refield.estimate.kept import Kept
 from refield.estimate.layers import Sight, layers_at
 from refield.estimate.look import Hidden, see, shaded
 from refield.estimate.matched import camera_from_object, matched_poses
 from refield.estimate.models import Models
 from refield.estimate.outline import ObjectConfig, remembered
 from refield.estimate.past import changed_share, gone_score, look_past
-from refield.estimate.pose_change import COARSEST, SIDE, RefineConfig, refine, residuals
+from refield.estimate.pose_change import COARSEST, FINER, SIDE, RefineConfig, refine, residuals
 from refield.estimate.register import RegisterConfig, Target, register, super_fibonacci, turns_about
+from refield.estimate.rotations import best_rotations, may_be_turned
 from refield.estimate.settle import looks_gone
-from refield.estimate.turns import may_be_turned, turned
 from refield.field.render import render_camera
 from refield.field.source import Known
 from refield.scene.camera import Camera
@@ -130,7 +131,8 @@ def turning(stage):
     """What turns are asked on."""
     return SimpleNamespace(
         field=BEFORE,
-        photographed=[],
+        photographed=stage.scene.capture.train,
+        details=Kept(),
         survey=stage.scene.survey,
         planes=[],
         believe=AssociateConfig(),
@@ -141,24 +143,53 @@ def turning(stage):
     )
 
 
-def test_all_turns_at_a_place_are_asked_what_they_explain(stage):
+def test_all_rotations_about_a_place_are_asked_what_they_explain(stage):
     """Begun at the right place a hundred degrees off, whence no descent leads back."""
     ground = turning(stage)
     sight = Sight(BEFORE, stage.old, stage.past, [stage.old])
     wrongly = refine(sight, turn(transform(TRUE, CRATE.world_from_box[:3, 3]), 100, (0.01, 0, 0)) @ TRUE)
-    found = turned(ground, sight, wrongly)
-    told = [change.explained for _, change in found]
-    assert error(wrongly.new_from_old)[0] > 45 and may_be_turned(ground, stage.old, stage.past, wrongly)
-    assert error(found[0][1].new_from_old)[0] < 1.5 and told[0] == max(told) > wrongly.explained + 0.1
+    (_, as_it_is), *found = best_rotations(ground, sight, wrongly)
+    best = max((change for _, change in found), key=lambda change: change.explained)
+    assert error(as_it_is.new_from_old)[0] > 45 and may_be_turned(ground, stage.old, stage.past, wrongly)
+    assert error(best.new_from_old)[0] < 1.5 and best.explained > as_it_is.explained + 0.1
+    later = SimpleNamespace(**(vars(ground) | {"photographed": []}))
+    assert not may_be_turned(later, stage.old, stage.past, wrongly)
 
 
-def test_the_best_turn_is_turned_on(stage):
-    """As far from the truth as the turns that are asked lie apart."""
+def test_the_best_rotation_is_climbed_from(stage):
+    """Half as far from the truth as the rotations lie apart, whence descent alone ends elsewhere."""
     ground = turning(stage)
     sight = Sight(BEFORE, stage.old, stage.past, [stage.old])
-    near = turn(transform(TRUE, CRATE.world_from_box[:3, 3]), 14, (0, 0, 0)) @ TRUE
-    on = turns._turned_on(ground, sight, stage.old, replace(refine(sight, TRUE), new_from_old=near))
-    assert error(on.new_from_old)[0] < 1.5
+    near = turn(transform(TRUE, CRATE.world_from_box[:3, 3]), 17, (0, 0, 0)) @ TRUE
+    descended = error(refine(sight, near, levels=FINER).new_from_old)[0]
+    climbed = error(rotations._climbed(ground, sight, stage.old, near).new_from_old)[0]
+    assert climbed < 3 < 0.5 * descended
+
+
+def test_crops_have_room_for_an_object_however_it_is_rotated(stage):
+    """The box of what lies across a photo is none of it standing on end."""
+    long = stage.old.lattice.centres[..., 0]
+    voxels = np.zeros_like(stage.old.voxels)
+    voxels[:, voxels.shape[1] // 2, voxels.shape[2] // 2] = True
+    old = replace(stage.old, voxels=voxels)
+    sight = Sight(BEFORE, old, stage.past, [old])
+    at = torch.from_numpy(old.centre).double()
+    upright = turn(at, 0, (0, 0, 0)).clone()
+    upright[:3, :3] = torch.tensor([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
+    upright[:3, 3] = at - upright[:3, :3] @ at
+    ends = transform(upright, torch.from_numpy(old.lattice.centres[voxels]).double())
+    assert long[voxels].max() > long[voxels].min()
+    for turning_too in (False, True):
+        ready = layers_at(sight, torch.eye(4).double(), 10**9, turning=turning_too)
+        inside = []
+        for crop in ready.crops:
+            frame = stage.past[crop.photo_index].view.frame.world_from_cam
+            uv, _ = crop.camera.project((ends - frame[:3, 3]).float() @ frame[:3, :3].float())
+            x0, y0, x1, y1 = crop.box
+            seen = (uv >= 0).all(-1) & (uv[:, 0] < crop.camera.width) & (uv[:, 1] < crop.camera.height)
+            held = (uv[:, 0] >= x0) & (uv[:, 0] <= x1) & (uv[:, 1] >= y0) & (uv[:, 1] <= y1)
+            inside.append(bool(held[seen].all()))
+        assert all(inside) is turning_too
 
 
 def test_a_place_may_be_known_of_another_point_than_the_middle(stage):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from refield.estimate import fit, recipe, settle, turns
+from refield.estimate import fit, recipe, rotations, settle
 from refield.estimate.lattice import Body, grown, some_of
 from refield.estimate.layers import Sight
-from refield.estimate.likelihood import Settled, judged, pixels_of
+from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of
 from refield.scene.pose import angle_between, transform
 from refield.scene.srgb import to_linear, to_srgb
 from refield.vision import pixels
@@ -232,33 +232,65 @@ def test_poses_that_the_photos_cannot_tell_apart_are_all_told(tmp_path):
 
 @pytest.mark.parametrize("shown", [True, False])
 def test_what_is_explained_less_than_it_is_shown_is_turned_right(shown, capture, tmp_path, monkeypatch):
-    """Found at its place and turned wrongly: unless old photos show no more of it than that, all turns are asked."""
+    """Found at its place and turned wrongly: unless old photos show no more of it, all rotations are asked."""
     _, (ground, (old,), changed, found) = settled(capture, tmp_path, monkeypatch)
     (k,) = found.moved
     wrongly = turn(transform(AWAY, CENTRE), 100, (0.01, 0, 0)) @ AWAY
     search = settle.Search(ground, changed)
     search.first[k] = old
     at = settle.refine(Sight(ground.field, old, settle.without(ground, changed, [old]), [old]), wrongly, ground.fine)
-    begun, least = judged(ground, search._with(found, k, old, at))
+    begun = replace(judged(ground, search._with(found, k, old, at))[0], led={k: 0.5})
     if not shown:
-        monkeypatch.setattr(turns, "shown_right", lambda *_: at.explained)
-    told, left = search._turned_right(begun, least, k)
+        monkeypatch.setattr(rotations, "shown_right", lambda *_: at.explained)
+    told = search.turned(begun)
     assert at.explained < 0.8 and float(angle_between(begun.moved[k].new_from_old, AWAY)) > 45
     assert (float(angle_between(told.moved[k].new_from_old, AWAY)) < 2) is shown
-    assert (left < least) is shown and (told is begun) is not shown
+    assert (told is begun) is not shown and told.led == {k: 0.5}
 
 
-def test_a_turn_is_taken_only_for_more_than_it_leaves_unexplained(capture, tmp_path, monkeypatch):
+def test_a_rotation_is_taken_only_for_more_than_it_leaves_unexplained(capture, tmp_path, monkeypatch):
     _, (ground, (old,), changed, found) = settled(capture, tmp_path, monkeypatch)
     ((k, change),) = found.moved.items()
-    asked = pixels_of(ground, found, k)
-    monkeypatch.setattr(settle, "may_be_turned", lambda *_: True)
-    monkeypatch.setattr(settle, "turned", lambda *_: [(old, replace(change, explained=1.0))])
+    asked = pixels_at(ground, found, k)
+    best = replace(change, explained=1.0)
     for explained, more, taken in [(0.5, 0.4, True), (0.5, 0.6, False), (0.99, -1.0, False)]:
-        begun = replace(found, moved={k: replace(change, explained=explained)})
-        monkeypatch.setattr(settle, "judged", lambda _, one, more=more: (one, 100.0 + more * asked))
-        told, _ = settle.Search(ground, changed)._turned_right(begun, 100.0, k)
+        least = {True: 100.0, False: 100.0 + more * asked}
+        begun = replace(found, moved={k: replace(change, explained=0.2)})  # otherwise refined, not compared
+        monkeypatch.setattr(settle, "judged", lambda _, one, b=begun, left=least: (one, left[one is b]))
+        now = (old, replace(change, explained=explained))
+        told = settle.Search(ground, changed)._turned_to(begun, k, [now, (old, best)])
         assert (told is not begun) is taken
+    assert settle.Search(ground, changed)._turned_to(begun, k, []) is begun
+
+
+def test_rotations_that_explain_as_much_as_the_best_are_told_with_it(capture, tmp_path, monkeypatch):
+    _, (ground, (old,), changed, found) = settled(capture, tmp_path, monkeypatch)
+    ((k, change),) = found.moved.items()
+    middle = transform(AWAY, CENTRE)
+    poses = [turn(middle, degrees, (0, 0, 0)) @ AWAY for degrees in (0, 0.01, 120, 60, 90)]
+    told = [(old, replace(change, new_from_old=p, explained=e)) for p, e in zip(poses, (0.9, 0.895, 0.89, 0.8, 0.5))]
+    monkeypatch.setattr(settle, "judged", lambda _, one: (one, 100.0))
+    turned = settle.Search(ground, changed)._turned_to(found, k, [told[-1], *told])
+    (twin,) = turned.twins[k]
+    assert torch.equal(twin.new_from_old, poses[2]) and torch.equal(turned.moved[k].new_from_old, poses[0])
+
+
+def test_a_rotation_that_makes_something_else_of_the_others_is_not_taken(capture, tmp_path, monkeypatch):
+    _, (ground, (old,), changed, found) = settled(capture, tmp_path, monkeypatch)
+    ((k, change),) = found.moved.items()
+    monkeypatch.setattr(settle, "judged", lambda _, one: (replace(one, removed={k + 1: 1.0}), 0.0))
+    poses = [(old, replace(change, explained=e)) for e in (0.5, 1.0)]
+    assert settle.Search(ground, changed)._turned_to(found, k, poses) is found
+
+
+def test_an_estimate_tells_an_object_as_it_was_turned(capture, tmp_path, monkeypatch):
+    def turned(self, told):
+        ((k, change),) = told.moved.items()
+        return replace(told, moved={k: replace(change, note="turned")})
+
+    monkeypatch.setattr(recipe.Search, "turned", turned)
+    change, _ = settled(capture, tmp_path, monkeypatch)
+    assert change.objects[0].note.endswith("turned")
 
 
 def test_an_object_is_put_where_its_thickest_part_fits_among_much_that_arrived(capture, tmp_path, monkeypatch):

@@ -300,13 +300,13 @@ def finest(ground: Ground, sight: Sight, poses: Sequence[Tensor], least: float =
     most = apart[0].explained if apart else 0.0
     least = max(least, most - SHIFTS) - SHIFTS
     for change in [c for c in apart[:_FEW] if c.explained >= least]:
-        found = _finished(ground, sight, change)
+        found = finished(ground, sight, change)
         if found is not None and not is_among(found[1], [other for _, other in out], found[0]):
             out.append(found)
     return out
 
 
-def _finished(ground: Ground, sight: Sight, rough: PoseChange) -> tuple[Old, PoseChange] | None:
+def finished(ground: Ground, sight: Sight, rough: PoseChange) -> tuple[Old, PoseChange] | None:
     """A pose refined to the end, with what old photos show of the object, and the object without what cannot be at the
     ``rough`` pose; None if no photo shows the place."""
     old, rough = trimmed(ground, sight, rough)

@@ -274,9 +274,15 @@ class Layers:
         return shift @ exp(twist) @ invert(shift) @ new_from_old
 
 
-def layers_at(sight: Sight, start: Tensor, rays: int) -> Layers:
-    """The photos around the place where ``start`` (4, 4) puts the object, scaled down to ``rays`` in all."""
-    corners = transform(start, torch.cartesian_prod(*sight.old.grid.tight_aabb().T.double())).numpy()
+def layers_at(sight: Sight, start: Tensor, rays: int, turning: bool = False) -> Layers:
+    """The photos around the place where ``start`` (4, 4) puts the object, scaled down to ``rays`` in all; ``turning``:
+    with room for it however it is rotated there."""
+    extent = sight.old.grid.tight_aabb().double()
+    if turning:
+        centre = torch.from_numpy(sight.old.centre)
+        reach = (torch.from_numpy(sight.old.lattice.centres[sight.old.voxels]) - centre).norm(dim=-1).max().expand(3)
+        extent, start = torch.stack([-reach, reach]), rigid(torch.eye(3).double(), transform(start, centre.double()))
+    corners = transform(start, torch.cartesian_prod(*extent.T.double())).numpy()
     boxes = [(p, box_in(p.view.frame.camera, p.view.frame, corners, _MARGIN)) for p in sight.past]
     total = sum((b[2] - b[0]) * (b[3] - b[1]) for _, b in boxes if b is not None)
     shrink = min(1.0, (rays / max(total, 1)) ** 0.5)

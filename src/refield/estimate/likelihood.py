@@ -121,8 +121,11 @@ def _before(
 
 def pixels_of(ground: Ground, settled: Settled, k: int) -> int:
     """How many pixels of the new photos show an object, or show where it was."""
-    old, change = settled.olds[k], settled.moved.get(k)
-    count = sum(int(silhouette(p.view, old).sum()) for p in settled.views)
-    if change is not None:
-        count += sum(int(_before(ground, old, change, p, p.rgb, p.beyond)[2].sum()) for p in settled.views)
-    return count
+    there = sum(int(silhouette(p.view, settled.olds[k]).sum()) for p in settled.views)
+    return there + (pixels_at(ground, settled, k) if k in settled.moved else 0)
+
+
+def pixels_at(ground: Ground, settled: Settled, k: int) -> int:
+    """How many pixels of the new photos show an object that moved."""
+    old, change = settled.olds[k], settled.moved[k]
+    return sum(int(_before(ground, old, change, p, p.rgb, p.beyond)[2].sum()) for p in settled.views)

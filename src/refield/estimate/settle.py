@@ -1,6 +1,7 @@
 """What became of everything that changed: the hypothesis by which the new photos are explained best.
 
-Begun with the objects placed one by one, then changed by one exchange at a time while that leaves less unexplained.
+Begun with the objects placed one by one, then changed by one exchange at a time while that leaves less unexplained; at
+last what is explained less than it might is rotated about its place.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
 from refield.estimate.lattice import Body, Voxels
 from refield.estimate.layers import Sight
-from refield.estimate.likelihood import Settled, judged, pixels_of
+from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import standing
 from refield.estimate.past import Past, changed_share
 from refield.estimate.pose_change import FINER, PoseChange, refine
-from refield.estimate.turns import may_be_turned, turned
+from refield.estimate.rotations import best_rotations, may_be_turned
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
@@ -70,8 +71,6 @@ class Search:
     """where what left may be among what arrived"""
     outlined: Kept[Old | None] = field(default_factory=Kept)
     """what went along with an object, by its motion"""
-    turns: Kept[list[tuple[Old, PoseChange]]] = field(default_factory=Kept)
-    """how an object may be turned where it is"""
     anew: dict[int, Old] = field(default_factory=dict)
     """what was outlined so, by its identity"""
 
@@ -94,28 +93,39 @@ class Search:
                     again, best, least, tried = True, other, tried[this], {}
         if begun is not None and judged(self.ground, begun)[1] <= least:
             return begun
-        for k in best.moved:
-            best, least = self._turned_right(best, least, k)
         return self._led(best, least, tried)
 
-    def _turned_right(self, best: Settled, least: float, k: int) -> tuple[Settled, float]:
-        """The best hypothesis with an object turned as the photos show more of it, if they show less than they might.
+    def turned(self, told: Settled) -> Settled:
+        """What was settled, with each object rotated about its place as the photos show more of it, where they show
+        less than they might.
 
-        The number that hypotheses are compared by hardly knows the turn of what is small: it may not tell against it.
+        The number that hypotheses are compared by hardly knows the rotation of what is small: a rotation may leave as
+        many pixels more unexplained as it explains more of the object.
         """
-        old, change = best.olds[k], best.moved[k]
-        gone, views = self._without(best, k, old)
-        if not may_be_turned(self.ground, old, views, change):
-            return best, least
-        sight = Sight(self.ground.field, old, views, gone)
-        found = [Fit(0.0, *one) for one in self.turns.get((old, change), partial(turned, self.ground, sight, change))]
-        self.fits[k] += found
-        more = max(found, key=lambda f: f.change.explained, default=None)
-        if more is None or more.change.explained < change.explained + ALIKE:
-            return best, least
-        other, left = judged(self.ground, self._with(best, k, more.old, more.change))
-        gained = (more.change.explained - change.explained) * pixels_of(self.ground, best, k)
-        return (other, left) if k in other.moved and left - least < gained else (best, least)
+        for k in told.moved:
+            old, change = told.olds[k], told.moved[k]
+            gone, views = self._without(told, k, old)
+            if may_be_turned(self.ground, old, views, change):
+                sight = Sight(self.ground.field, old, views, gone)
+                told = self._turned_to(told, k, best_rotations(self.ground, sight, change))
+        return told
+
+    def _turned_to(self, told: Settled, k: int, found: Sequence[tuple[Old, PoseChange]]) -> Settled:
+        """What was settled, with an object at the best of some poses, the first of which is the one that is told."""
+        old, best = max(found, key=lambda one: one[1].explained, default=(told.olds[k], told.moved[k]))
+        if not found or best.explained < found[0][1].explained + ALIKE:
+            return told
+        other, left = judged(self.ground, self._with(told, k, old, best))
+        if other.moved.keys() != told.moved.keys() or other.removed.keys() != told.removed.keys():
+            return told
+        gained = (best.explained - found[0][1].explained) * pixels_at(self.ground, other, k)
+        if left - judged(self.ground, told)[1] > gained:
+            return told
+        twins: list[PoseChange] = []
+        for _, one in found:
+            if one.explained > best.explained - ALIKE and not is_among(one, (best, *twins), old):
+                twins.append(one)
+        return replace(other, led=told.led, twins={**told.twins, k: tuple(twins)})
 
     def _led(self, best: Settled, least: float, tried: dict[_Which, float]) -> Settled:
         """The best hypothesis with how far it leads the other answers for each object that it tells of, and the poses
@@ -128,8 +138,7 @@ class Search:
             if tried.get(("turned", k, 0), math.inf) - least < ALIKE * asked:
                 apart: list[PoseChange] = []
                 for one in self._turned(best, k):
-                    alike = k in one.moved and one.moved[k].explained > best.moved[k].explained - ALIKE
-                    alike = alike and judged(self.ground, one)[1] - least < ALIKE * asked
+                    alike = k in one.moved and judged(self.ground, one)[1] - least < ALIKE * asked
                     if alike and not is_among(one.moved[k], (best.moved[k], *apart), best.olds[k]):
                         apart.append(one.moved[k])
                 twins[k] = tuple(apart)
