@@ -90,7 +90,7 @@ def test_an_outline_that_fits_is_cut_where_one_side_alone_is_shown(monkeypatch, 
     sides = SimpleNamespace(), SimpleNamespace()
     ready = SimpleNamespace(apparent=10.0, explained_of=lambda asked, *_: list(told))
     monkeypatch.setattr(fit, "layers_at", lambda *_: ready)
-    monkeypatch.setattr(fit, "_detail", lambda *_: None)
+    monkeypatch.setattr(fit, "detail_for", lambda *_: None)
     whole = Fit(0.1, SimpleNamespace(), SimpleNamespace(new_from_old=None))
     ground = SimpleNamespace(field=None, fine=RefineConfig(), believe=AssociateConfig())
     assert fit._shows_one_side(ground, whole, sides, [], []) == one_alone
