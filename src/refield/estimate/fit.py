@@ -155,6 +155,15 @@ def is_among(change: PoseChange, others: Iterable[PoseChange], old: Old) -> bool
     return any(at_one_place(other, change, old) for other in others)
 
 
+def all_apart(changes: Iterable[PoseChange], old: Old, others: Sequence[PoseChange] = ()) -> list[PoseChange]:
+    """Those pose changes that put an object at another place than those before them, and than some others, do."""
+    apart: list[PoseChange] = []
+    for change in changes:
+        if not is_among(change, (*others, *apart), old):
+            apart.append(change)
+    return apart
+
+
 def at_one_place(one: PoseChange, other: PoseChange, old: Old) -> bool:
     """Whether two poses put an object at the same place, within a pixel or two."""
     points = torch.from_numpy(old.cloud.points).double()
@@ -292,10 +301,7 @@ def finest(ground: Ground, sight: Sight, poses: Sequence[Tensor], least: float =
     """The few poses of an object that explain most, each another place, refined to the end: what looks much alike when
     it is turned is told apart by what is fine. None that could not be the best, nor explain ``least`` of its pixels."""
     rough = [refine(sight, pose, ground.fine, COARSEST) for pose in poses]
-    apart: list[PoseChange] = []
-    for change in sorted((c for c in rough if c is not None), key=lambda c: -c.explained):
-        if not is_among(change, apart, sight.old):
-            apart.append(change)
+    apart = all_apart(sorted((c for c in rough if c is not None), key=lambda c: -c.explained), sight.old)
     out = list[tuple[Old, PoseChange]]()
     most = apart[0].explained if apart else 0.0
     least = max(least, most - SHIFTS) - SHIFTS

@@ -24,10 +24,10 @@ from refield.estimate.detect import Changed
 from refield.estimate.fit import (
     ALIKE,
     Fit,
+    all_apart,
     at_one_place,
     believed,
     gains_enough,
-    is_among,
     left_by,
     places_among,
     rest_of,
@@ -121,10 +121,7 @@ class Search:
         gained = (best.explained - found[0][1].explained) * pixels_at(self.ground, other, k)
         if left - judged(self.ground, told)[1] > gained:
             return told
-        twins: list[PoseChange] = []
-        for _, one in found:
-            if one.explained > best.explained - ALIKE and not is_among(one, (best, *twins), old):
-                twins.append(one)
+        twins = all_apart((one for _, one in found if one.explained > best.explained - ALIKE), old, [best])
         return replace(other, led=told.led, twins={**told.twins, k: tuple(twins)})
 
     def _led(self, best: Settled, least: float, tried: dict[_Which, float]) -> Settled:
@@ -136,12 +133,12 @@ class Search:
             other = min((left for (kind, j, *_), left in tried.items() if j == k and kind in _OTHERS), default=math.inf)
             led[k] = (other - least) / asked
             if tried.get(("turned", k, 0), math.inf) - least < ALIKE * asked:
-                apart: list[PoseChange] = []
-                for one in self._turned(best, k):
-                    alike = k in one.moved and judged(self.ground, one)[1] - least < ALIKE * asked
-                    if alike and not is_among(one.moved[k], (best.moved[k], *apart), best.olds[k]):
-                        apart.append(one.moved[k])
-                twins[k] = tuple(apart)
+                alike = (
+                    one.moved[k]
+                    for one in self._turned(best, k)
+                    if k in one.moved and judged(self.ground, one)[1] - least < ALIKE * asked
+                )
+                twins[k] = tuple(all_apart(alike, best.olds[k], [best.moved[k]]))
         return replace(best, led=led, twins=twins)
 
     def _exchanges(self, best: Settled) -> list[tuple[_Which, _Tries]]:
