@@ -26,7 +26,7 @@ def run(tmp_path, monkeypatch):
             if seed in outcomes:
                 raise outcomes[seed]
             score = score_change(SceneChange(), SceneChange())
-            return Rehearsed(seed, FACTS, 30.0, score, None, "", 1.0)
+            return [Rehearsed(seed, FACTS, 30.0, score, None, "", 1.0)]
 
         monkeypatch.setattr(rehearse, "prepared", lambda *_: (None, 1.0))
         monkeypatch.setattr(rehearse, "rehearsed", rehearsed)
@@ -63,3 +63,21 @@ def test_programs_are_told_what_is_done_and_why_there_is_no_more(run, capsys):
         run("0..2", {1: KeyboardInterrupt()}, as_json=True)
     document = json.loads(capsys.readouterr().out)
     assert [r["seed"] for r in document["rehearsals"]] == [0] and document["error"]["what"] == "interrupted"
+
+
+def test_changes_of_a_rehearsal_that_are_done_are_told_when_the_next_is_interrupted(run, monkeypatch, tmp_path, capsys):
+    def two(scenery, folder, seed, clock, options):
+        folder.mkdir()
+        yield Rehearsed(seed, FACTS, 30.0, score_change(SceneChange(), SceneChange()), None, "", 1.0, 0)
+        raise KeyboardInterrupt
+
+    run("0", {})
+    monkeypatch.setattr(rehearse, "rehearsed", two)
+    asked = Rehearse(tmp_path / "work", "0", tmp_path / "other", changes=2, fit=FitConfig())
+    capsys.readouterr()
+    with pytest.raises(KeyboardInterrupt):
+        told(lambda: rehearse.run(asked), as_json=False)
+    assert "1 of 1 changes" in capsys.readouterr().out
+    assert (tmp_path / "other" / "000").is_dir()  # what is told of is kept
+    (one,) = json.loads((tmp_path / "other" / rehearse.REPORT).read_text())["rehearsals"]
+    assert (one["seed"], one["number"]) == (0, 0)

@@ -13,7 +13,7 @@ from refield.commands import rehearse
 from refield.commands.answer import told
 from refield.field.fit import FitConfig
 from refield.field.render import render_camera
-from refield.rehearse.compose import compose, divided, scenery_of
+from refield.rehearse.compose import compose, compose_several, divided, scenery_of
 from refield.rehearse.plan import HAPPENINGS
 from refield.rehearse.surfaces import View, _planes
 from refield.scene.camera import Camera
@@ -28,6 +28,7 @@ from refield.synthetic.oracles import AnalyticField
 from refield.synthetic.placing import box_item, floor
 from refield.synthetic.random_textures import PATTERNS
 from refield.synthetic.state import State
+from refield.workspace import Workspace
 
 CAMERA = Camera(72, 64, 70.0, 70.0, 36.0, 32.0, k1=0.05)
 COUNT = 20
@@ -139,6 +140,31 @@ def test_the_same_seed_makes_the_same_photos(scenery, rehearsed, tmp_path):
     assert torch.equal(a, b)
 
 
+def test_several_changes_begin_with_the_same_photos(scenery, tmp_path):
+    folders = compose_several(scenery, tmp_path, 3, 4)
+    before = load_transforms(tmp_path / "before")
+    assert [f.name for f in folders] == [f"change-{k:02d}" for k in range(4)] and len(before.frames) == COUNT - 8
+    truths = [load_change(folder / "truth", before) for folder in folders]
+    facts = [read_json(folder / "truth" / "world.json") for folder in folders]
+    for k, (folder, truth, fact) in enumerate(zip(folders, truths, facts)):
+        gone = [o for o in truth.objects if o.kind != "added"]
+        assert len(gone) == 1 + k % 3 and fact["changes"] == [o.kind for o in truth.objects] and fact["change"] == k
+        after = load_transforms(folder / "after")
+        assert len(after.frames) == 4
+        for frame, now, then in zip(after.frames, truth.masks_in, truth.masks_out):
+            assert torch.equal(read_mask(folder / "after" / "masks_in" / frame.path.name), now)
+            assert torch.equal(read_mask(folder / "after" / "masks_out" / frame.path.name), then)
+        differs = (frame_image(after.frames[0]) != frame_image(scenery.photos.after[0])).any(-1)
+        assert (truth.masks_in[0] & differs).sum() >= 0.8 * truth.masks_in[0].sum()
+        # the old photos show what left or moved, whichever change is asked
+        for o in gone:
+            assert sum(int(m.sum()) for m in o.masks if m is not None) > 50
+    assert len({str(fact["objects"]) for fact in facts}) > 1
+    compose_several(scenery, tmp_path / "again", 3, 2)
+    for name in ("before/images/0003.png", "change-01/after/images/0002.png"):
+        assert torch.equal(read_image(tmp_path / name), read_image(tmp_path / "again" / name))
+
+
 def test_without_a_plane_things_float_and_this_is_told(scenery, tmp_path):
     surfaces = replace(scenery.surfaces, planes=())
     plan = compose(replace(scenery, surfaces=surfaces), tmp_path, 1)
@@ -159,6 +185,22 @@ def test_a_capture_without_a_field_is_refused(tmp_path, capsys):
         assert "train it first" in capsys.readouterr().err
     assert main(["synth", "cube", out, "--into", data]) == 2
     assert "random" in capsys.readouterr().err
+
+
+def test_several_changes_are_rehearsed_on_one_training(scenery, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(rehearse, "prepared", lambda *_: (scenery, 1.0))
+    out = tmp_path / "out"
+    asked = rehearse.Rehearse(tmp_path / "work", "3", out, changes=2, fit=FitConfig(steps=40))
+    told(lambda: rehearse.run(asked), as_json=False)
+    done = read_json(out / rehearse.REPORT)["rehearsals"]
+    assert [(r["seed"], r["number"], r["facts"]["change"]) for r in done] == [(3, 0, 0), (3, 1, 1)]
+    assert done[0]["held_out_psnr"] == done[1]["held_out_psnr"] > 10
+    assert all(r["evaluation"]["pooled"]["psnr"] > 5 and r["refused"] == "" for r in done)
+    said = capsys.readouterr().out
+    assert "3.0" in said and "3.1" in said and "of 2 changes" in said
+    assert Workspace.open(out / "003/work").visits == 1  # the last; those before are taken back
+    assert main(["rehearse", str(tmp_path / "work"), "--changes", "0"]) == 2
+    assert "--changes" in capsys.readouterr().err
 
 
 def test_a_rehearsal_from_photos_to_numbers(scenery, tmp_path, capsys, monkeypatch):

@@ -8,10 +8,11 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -25,13 +26,14 @@ from refield.commands.update import Update, update
 from refield.evaluate import Report
 from refield.field.fit import FitConfig, need_device
 from refield.field.quality import OPEN, Quality
-from refield.rehearse.compose import Scenery, compose, divided, scenery_of
+from refield.rehearse.compose import Scenery, compose, compose_several, divided, scenery_of
 from refield.rehearse.plan import NoRoomError
 from refield.rehearse.score import ChangeScore, score_change
 from refield.scene.change_files import load_change
 from refield.scene.errors import InputError
 from refield.scene.files import read_json, write_json
 from refield.scene.world import world_of
+from refield.visits.make import take_back
 from refield.visits.visit import Visit
 from refield.workspace import Workspace, refuse_inside
 
@@ -39,23 +41,30 @@ REPORT = "rehearsals.json"
 _MOST = 100
 
 
-EXAMPLES = ("refield rehearse work", "refield rehearse work --seeds 0..6 --out rehearsals")
+EXAMPLES = (
+    "refield rehearse work",
+    "refield rehearse work --seeds 0..6 --out rehearsals",
+    "refield rehearse work --seeds 0 --changes 6",
+)
 
 
 @dataclass(frozen=True)
 class Rehearse:
     """Put known objects and changes into a workspace's own photos, train and update on them, and tell how well it went.
 
-    The workspace stays as it is. Each rehearsal takes about as long as a training and an update.
+    The workspace stays as it is. Each rehearsal takes about as long as a training and its updates.
     """
 
     work: Annotated[Path, arg(metavar="WORK"), Positional]
     """the workspace whose photos are used"""
     seeds: str = "0..2"
-    """which rehearsals: a number, or from..to; seed 0 moves an object, 1 adds one, 2 removes one, 3 changes several,
-    4 turns one, 5 tips one over, 6 changes nothing, and so on round and round"""
+    """which rehearsals: a number, or from..to; with one change each, seed 0 moves an object, 1 adds one, 2 removes one,
+    3 changes several, 4 turns one, 5 tips one over, 6 changes nothing, and so on round and round"""
     out: Path | None = None
     """an empty folder for the photos, workspaces and numbers of the rehearsals; without it only the table is told"""
+    changes: int = 1
+    """with more than one, each rehearsal puts three objects into the photos, trains once, and so many times changes one
+    to three of them, and now and then adds one; each update is taken back before the next"""
     placed: bool = True
     """the new photos come with their poses; --no-placed has them placed by what they show, as photos of your own are"""
     quality: Quality = "draft"
@@ -66,7 +75,7 @@ class Rehearse:
 
 @dataclass(frozen=True)
 class Rehearsed:
-    """One rehearsal's outcome."""
+    """What came of a rehearsal, or of one of its changes."""
 
     seed: int
     facts: dict[str, Any]
@@ -77,10 +86,14 @@ class Rehearsed:
     evaluation: Report | None
     refused: str
     seconds: float
+    """the first of several changes takes the composing and the training as well"""
+    number: int | None = None
+    """of its change, from 0, where a rehearsal has several"""
 
     def to_dict(self) -> dict[str, Any]:
         return {
             "seed": self.seed,
+            "number": self.number,
             "facts": self.facts,
             "held_out_psnr": self.psnr if math.isfinite(self.psnr) else None,
             "change": None if self.change is None else self.change.to_dict(),
@@ -91,11 +104,13 @@ class Rehearsed:
 
 
 def run(options: Rehearse) -> Answer:
+    if not 1 <= options.changes <= _MOST:
+        raise InputError("--changes", f"is {options.changes}", f"give 1 to {_MOST}")
     seeds, clock = seeds_of(options.seeds), Clock(quiet=options.output.quiet, verbose=options.output.verbose)
     if options.out is not None:
         _refuse_unless_free(options.work, options.out)
     need_device(options.fit.device)
-    scenery, size = prepared(options.work, clock, (options.fit, options.quality), len(seeds))
+    scenery, size = prepared(options.work, clock, (options.fit, options.quality), (len(seeds), options.changes))
     done: list[Rehearsed] = []
     stop: BaseException | None = None
     try:
@@ -123,23 +138,31 @@ def _rehearse_all(
         NoRoomError: there was none for any.
     """
     for k, seed in enumerate(seeds, 1):
+        place, before = folder / f"{seed:03d}", len(done)
         try:
-            with _whole(folder / f"{seed:03d}") as place:
-                done.append(rehearsed(scenery, place, seed, clock, options))
-        except NoRoomError as error:
-            if k == len(seeds) and not done:
+            for one in rehearsed(scenery, place, seed, clock, options):
+                done.append(one)
+                if options.out is not None:
+                    write_json(options.out / REPORT, _record(done, size))
+        except BaseException as error:
+            if len(done) == before:  # of which nothing is told
+                shutil.rmtree(place, ignore_errors=True)
+            if not isinstance(error, NoRoomError) or (k == len(seeds) and not done):
                 raise
             clock.warn(f"rehearsal {seed} is left out: {error}")
             continue
-        if options.out is not None:
-            write_json(options.out / REPORT, _record(done, size))
-        left = (len(seeds) - k) * sum(r.seconds for r in done) / len(done)
+        left = (len(seeds) - k) * sum(r.seconds for r in done) / len({r.seed for r in done})
         if left:
             clock.console.print(f"           {k} of {len(seeds)} rehearsed, about {duration(left)} left")
 
 
-def prepared(work: Path, clock: Clock, asked: tuple[FitConfig, Quality], count: int) -> tuple[Scenery, float]:
+def prepared(
+    work: Path, clock: Clock, asked: tuple[FitConfig, Quality], counts: tuple[int, int]
+) -> tuple[Scenery, float]:
     """A workspace as a scenery, and how large its world is; tells how long the rehearsals will take.
+
+    Args:
+        counts: how many there are, and how many changes each has.
 
     Raises:
         InputError: it is no workspace, or has too few photos.
@@ -148,8 +171,9 @@ def prepared(work: Path, clock: Clock, asked: tuple[FitConfig, Quality], count: 
     capture = workspace.capture()
     divided(capture)
     seconds = sum(survey_capture(capture, asked).seconds.values())
-    each = f"each about one training (some {duration(seconds)} on this machine) and one update"
-    clock.console.print(f"{count} rehearsals, {each}; Ctrl-C leaves nothing half done", markup=False)
+    updates = "one update" if counts[1] == 1 else f"{counts[1]} updates"
+    each = f"each about one training (some {duration(seconds)} on this machine) and {updates}"
+    clock.console.print(f"{counts[0]} rehearsals, {each}; Ctrl-C leaves nothing half done", markup=False)
     clock.stage("find out how far off things are")
     with clock.counting("views") as tell:
         return scenery_of(workspace.field(), capture, tell), world_of(capture).size
@@ -170,28 +194,58 @@ def opened(work: Path) -> Workspace:
         raise InputError(work, what, f"train it first: refield train {work} WORK, then give WORK") from error
 
 
-def rehearsed(scenery: Scenery, folder: Path, seed: int, clock: Clock, options: Rehearse) -> Rehearsed:
-    """Composite, fit, update and score one rehearsal in ``folder``, by what the commands call."""
+def rehearsed(scenery: Scenery, folder: Path, seed: int, clock: Clock, options: Rehearse) -> Iterator[Rehearsed]:
+    """Composite, fit, update and score a rehearsal in ``folder``, by what the commands call; one after the other of its
+    changes."""
     began = clock.total
     clock.stage(f"rehearsal {seed}: put objects into the photos")
-    data, work = folder / "data", folder / "work"
+    data, work, several = folder / "data", folder / "work", options.changes > 1
     with writable(folder), clock.counting("photos") as tell:
-        compose(scenery, data, seed, tell)
+        if several:
+            places = compose_several(scenery, data, seed, options.changes, tell)
+        else:
+            compose(scenery, data, seed, tell)
+            places = [data]
     psnr = train(Sources(data / "before", work), clock, options.fit, overwrite=False, quality=options.quality)
-    photos = data / "after" if options.placed else data / "after" / "images"
+    for number, place in enumerate(places):
+        if several:
+            clock.stage(f"rehearsal {seed}: change {number}, of {options.changes} from 0")
+        workspace = Workspace.open(work)
+        if workspace.visits:
+            take_back(workspace)
+        one = _updated(place, work, (seed, psnr), clock, options.placed)
+        yield replace(one, seconds=clock.total - began, number=number if several else None)
+        began = clock.total
+
+
+def _updated(place: Path, work: Path, of: tuple[int, float], clock: Clock, placed: bool) -> Rehearsed:
+    """What an update of a workspace by the new photos of a change tells, and how well it shows them.
+
+    Args:
+        of: the rehearsal's seed, and the PSNR of the field, dB.
+    """
+    photos = place / "after" if placed else place / "after" / "images"
     visit: Visit | None = None
     refused = ""
     try:
-        visit = update(Update(work, photos, evaluation=data / "eval"), clock)
+        visit = update(Update(work, photos, evaluation=place / "eval"), clock)
     except InputError as error:
         refused = str(error)
         clock.warn(f"the update was refused: {refused}")
     clock.stop()
-    truth = load_change(data / "truth", masks=False)
+    truth = load_change(place / "truth", masks=False)
     score = None if visit is None else score_change(visit.change, truth)
-    evaluation = None if visit is None else visit.evaluation
-    facts = read_json(data / "truth" / "world.json")
-    return Rehearsed(seed, facts, psnr, score, evaluation, refused, clock.total - began)
+    evaluation = None if visit is None else _numbers(visit.evaluation)
+    return Rehearsed(of[0], read_json(place / "truth" / "world.json"), of[1], score, evaluation, refused, 0.0)
+
+
+def _numbers(report: Report | None) -> Report | None:
+    """An evaluation without its pictures, which are large: there may be many."""
+    if report is None:
+        return None
+    none = torch.empty(0)
+    views = (replace(v, truth=none, render=none, render_before=None, mask_in=None, mask_out=None) for v in report.views)
+    return replace(report, views=tuple(views))
 
 
 def seeds_of(text: str) -> list[int]:
@@ -212,7 +266,7 @@ def seeds_of(text: str) -> list[int]:
 
 
 def table(done: Sequence[Rehearsed], size: float) -> Table:
-    """One row a rehearsal."""
+    """One row a rehearsal, or a change where they have several."""
     out = Table(title="what to expect here (in brackets: the field before the update)")
     for column in ("seed", "happened", "found", "shift off", "of scene", "turn off", "PSNR-in", "-out", "untouched"):
         out.add_column(column, justify="left" if column in ("happened", "found") else "right")
@@ -221,19 +275,22 @@ def table(done: Sequence[Rehearsed], size: float) -> Table:
         worst = max((o.shift_error or 0.0 for o in shifts), default=None)
         turn = max((o.turn_error_deg or 0.0 for o in shifts), default=None)
         out.add_row(
-            str(r.seed), _happened(r), _found(r),
+            str(r.seed) if r.number is None else f"{r.seed}.{r.number}", _happened(r), _found(r),
             "-" if worst is None else f"{worst:.3g}",
             "-" if worst is None or size <= 0 else f"{100 * worst / size:.2f} %",
             "-" if turn is None else f"{turn:.1f}°",
             *(_decibels(r.evaluation, region) for region in ("psnr_in", "psnr_out", "psnr_untouched")),
         )  # fmt: skip
     right = sum(r.change is not None and r.change.all_right for r in done)
-    out.caption = f"{right} of {len(done)} rehearsals with every change told rightly and none besides"
+    what = "rehearsals" if all(r.number is None for r in done) else "changes"
+    out.caption = f"{right} of {len(done)} {what} with every change told rightly and none besides"
     return out
 
 
 def _happened(r: Rehearsed) -> str:
     happening, changes = r.facts["happening"], r.facts["changes"]
+    if r.number is not None:
+        return ", ".join(changes)
     return happening if changes in ([], [happening]) else f"{happening} ({', '.join(changes)})"
 
 
@@ -254,16 +311,6 @@ def _decibels(report: Report | None, region: str) -> str:
 
 def _record(done: Sequence[Rehearsed], size: float) -> dict[str, Any]:
     return {"scene_size": size, "rehearsals": [r.to_dict() for r in done]}
-
-
-@contextlib.contextmanager
-def _whole(folder: Path) -> Iterator[Path]:
-    """A folder that is removed if what fills it does not come to its end."""
-    try:
-        yield folder
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
 
 
 def _refuse_unless_free(work: Path, out: Path) -> None:

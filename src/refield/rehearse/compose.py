@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from refield.field.radiance import Field
-from refield.rehearse.plan import Plan, plan_of
-from refield.rehearse.spots import sites_of
+from refield.rehearse.plan import Plan, plan_of, plans_of
+from refield.rehearse.spots import Site, sites_of
 from refield.rehearse.surfaces import Standing, Surfaces, View, depth_in, surfaces_of
 from refield.scene.capture import Capture, Frame
 from refield.scene.change_files import save_change
@@ -27,7 +27,7 @@ from refield.scene.world import world_of
 from refield.synthetic.insert import Shot, inserted, seen_in
 from refield.synthetic.looks import gain_of, look_of
 from refield.synthetic.shading import CastShadow
-from refield.synthetic.state import State
+from refield.synthetic.state import State, World
 from refield.synthetic.write import masks_of, true_change
 
 Count = Callable[[int, int], None]
@@ -94,6 +94,25 @@ def compose(scenery: Scenery, out: Path, seed: int, on_progress: Count | None = 
     Raises:
         NoRoomError: there is no free place that enough photos see.
     """
+    plan = plan_of(_sites(scenery, seed), seed)
+    _photographed(scenery, [(plan, out)], out, on_progress)
+    return plan
+
+
+def compose_several(scenery: Scenery, out: Path, seed: int, count: int, on_progress: Count | None = None) -> list[Path]:
+    """Write ``before/`` into the folder ``out``, and into a folder in it for each of several changes all else that a
+    rehearsal has; those folders. Everything random is from ``seed``.
+
+    Raises:
+        NoRoomError: there is no free place that enough photos see.
+    """
+    plans = plans_of(_sites(scenery, seed), seed, count)
+    folders = [out / f"change-{k:02d}" for k in range(count)]
+    _photographed(scenery, list(zip(plans, folders)), out, on_progress)
+    return folders
+
+
+def _sites(scenery: Scenery, seed: int) -> list[Site]:
     photos, surfaces = scenery.photos, scenery.surfaces
     views = {id(view.frame): view for view in surfaces.views}
 
@@ -101,24 +120,30 @@ def compose(scenery: Scenery, out: Path, seed: int, on_progress: Count | None = 
         return [views[id(frame)] for frame in frames]
 
     groups = (group(photos.before), group(photos.after), group(photos.evaluation))
-    plan = plan_of(sites_of(surfaces, scenery.up, groups, seed), seed)
-    studio = _Studio(scenery, plan)
-    world, total, done = plan.world, len(scenery.capture.frames), 0
-    captures = {}
-    for folder, frames, state in (
-        ("before", photos.before, world.before),
-        ("after", photos.after, world.after),
-        ("eval", photos.evaluation, world.after),
-    ):
+    return sites_of(surfaces, scenery.up, groups, seed)
+
+
+def _photographed(scenery: Scenery, plans: Sequence[tuple[Plan, Path]], out: Path, on_progress: Count | None) -> None:
+    """Write the photos before, which plans have in common, into ``out``; what came after into a folder for each."""
+    photos, studio = scenery.photos, _Studio(scenery, [plan for plan, _ in plans])
+    fresh = len(photos.after) + len(photos.evaluation)
+    total, done = len(photos.before) + len(plans) * fresh, 0
+
+    def taken(folder: Path, frames: Sequence[Frame], state: State) -> Capture:
+        nonlocal done
         first, done = done, done + len(frames)
         tell = None if on_progress is None else partial(_tell, on_progress, first, total)
-        captures[folder] = studio.photograph(out / folder, frames, state, tell)
-    for folder in ("after", "eval"):
-        studio.write_masks(out / folder, captures[folder])
-    (out / "truth").mkdir(exist_ok=True)
-    save_change(out / "truth", true_change(world, captures["before"], captures["after"].frames, studio.seen))
-    write_json(out / "truth" / "world.json", plan.facts | _size(captures))
-    return plan
+        return studio.photograph(folder, frames, state, tell)
+
+    before = taken(out / "before", photos.before, plans[0][0].world.before)
+    for plan, place in plans:
+        world, captures = plan.world, {"before": before}
+        for folder, frames in (("after", photos.after), ("eval", photos.evaluation)):
+            captures[folder] = taken(place / folder, frames, world.after)
+            studio.write_masks(place / folder, captures[folder], world)
+        (place / "truth").mkdir(exist_ok=True)
+        save_change(place / "truth", true_change(world, before, captures["after"].frames, studio.seen))
+        write_json(place / "truth" / "world.json", plan.facts | _size(captures))
 
 
 def _tell(on_progress: Count, first: int, total: int, done: int) -> None:
@@ -130,38 +155,64 @@ def _size(captures: dict[str, Capture]) -> dict[str, Any]:
     return {"scene_size": world.size, "photos": {name: len(c.frames) for name, c in captures.items()}}
 
 
-class _Studio:
-    """Puts a plan's objects into photos, and remembers what each shows of which."""
+@dataclass(frozen=True)
+class _Crop:
+    """A map of items without its empty border: many photos are large, and each is asked of several states."""
 
-    def __init__(self, scenery: Scenery, plan: Plan) -> None:
-        self._scenery, self._plan, site = scenery, plan, plan.site
+    shape: tuple[int, int]
+    corner: tuple[int, int]
+    items: Tensor
+    """(h, w) int8, -1 for none"""
+
+    @staticmethod
+    def of(items: Tensor) -> _Crop:
+        at = (items >= 0).nonzero()
+        low, high = (at.amin(0), at.amax(0) + 1) if len(at) else (at.new_zeros(2), at.new_zeros(2))
+        (i, j), (k, m) = low.tolist(), high.tolist()
+        return _Crop((items.shape[0], items.shape[1]), (i, j), items[i:k, j:m].to(torch.int8).clone())
+
+    def whole(self) -> Tensor:
+        out = torch.full(self.shape, -1, dtype=torch.int8)
+        (i, j), (h, w) = self.corner, self.items.shape
+        out[i : i + h, j : j + w] = self.items
+        return out
+
+
+class _Studio:
+    """Puts plans' objects into photos, and remembers what each shows of which; they begin with the same state."""
+
+    def __init__(self, scenery: Scenery, plans: Sequence[Plan]) -> None:
+        self._scenery, self._light, site = scenery, plans[0].light, plans[0].site
+        self._states = [plans[0].world.before, *(plan.world.after for plan in plans)]
         self._standing, plane = None, None
         if site.offset is not None:
             self._standing = Standing(site.up, site.offset, 2 * site.even)
             plane = (site.up, site.offset, 2 * site.even)
-        self._shadow = {s: CastShadow(state, plan.light, plane) for s, state in self._states()}
-        self._items: dict[tuple[Path, str], Tensor] = {}  # of every photo, in both states
-        self._depth: dict[Path, Tensor] = {}  # of those of the new state
+        self._shadows = [CastShadow(state, self._light, plane) for state in self._states]
+        self._items: dict[tuple[Path, int], _Crop] = {}  # of every photo, in the states that are asked of it
+        self._depth: dict[Path, Tensor] = {}  # of those of new states, until they are written
 
-    def _states(self) -> tuple[tuple[str, State], tuple[str, State]]:
-        return ("before", self._plan.world.before), ("after", self._plan.world.after)
+    def _number(self, state: State) -> int:
+        return next(k for k, one in enumerate(self._states) if one is state)
 
     def photograph(
         self, folder: Path, frames: Sequence[Frame], state: State, tell: Callable[[int], None] | None
     ) -> Capture:
         """Write the photos of a state (transforms.json, images/)."""
-        name = next(n for n, s in self._states() if s is state)
-        kept = []
+        number, kept = self._number(state), []
+        asked = range(len(self._states)) if number == 0 else (0, number)
+        # the photos before do not depend on how many changes follow
+        close = self._states[:1] if number == 0 and len(self._states) > 2 else [self._states[k] for k in asked]
         for i, frame in enumerate(frames):
             path = folder / "images" / f"{i:04d}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
-            shot = self._shot(frame)
-            picture = inserted(shot, state, self._plan.light, self._shadow[name], seed=i)
+            shot = self._shot(frame, close)
+            picture = inserted(shot, state, self._light, self._shadows[number], seed=i)
             write_image(path, picture.image)
-            for label, other in self._states():
-                item = picture.item if label == name else seen_in(shot, other)
-                self._items[path, label] = item.to(torch.int8)  # many photos are large
-            if name == "after":
+            for k in asked:
+                item = picture.item if k == number else seen_in(shot, self._states[k])
+                self._items[path, k] = _Crop.of(item)
+            if number > 0:
                 self._depth[path] = picture.depth
             kept.append(replace(frame, path=path, name=f"images/{path.name}"))
             if tell is not None:
@@ -170,33 +221,33 @@ class _Studio:
         save_transforms(folder / "transforms.json", capture)
         return capture
 
-    def write_masks(self, folder: Path, capture: Capture) -> None:
+    def write_masks(self, folder: Path, capture: Capture, world: World) -> None:
         """``masks_in/``, ``masks_out/`` and ``depth/`` of photos of the new state."""
         for kind in ("masks_in", "masks_out", "depth"):
             (folder / kind).mkdir(parents=True, exist_ok=True)
         for frame in capture.frames:
-            now, then = masks_of(self._plan.world, frame, self.seen)
+            now, then = masks_of(world, frame, self.seen)
             write_image(folder / "masks_in" / frame.path.name, now)
             write_image(folder / "masks_out" / frame.path.name, then)
-            depth = self._depth[frame.path].numpy()
+            depth = self._depth.pop(frame.path).numpy()
             np.savez_compressed(folder / "depth" / f"{frame.path.stem}.npz", depth=depth)
 
     def seen(self, state: State, frame: Frame) -> Tensor:
         """Which item of a state each pixel of a photo would show, (H, W) int8, -1 for none: the truth's `Seen`."""
-        return self._items[frame.path, next(n for n, s in self._states() if s is state)]
+        return self._items[frame.path, self._number(state)].whole()
 
-    def _shot(self, frame: Frame) -> Shot:
-        """A photo with what is known of it."""
+    def _shot(self, frame: Frame, states: Sequence[State]) -> Shot:
+        """A photo with what is known of it, most exactly where the objects of some states are."""
         scenery = self._scenery
         image = frame_image(frame)
         view = next(v for v in scenery.surfaces.views if v.frame is frame)
         gain = gain_of(scaled_image(frame, view.camera), view.rgb, view.depth.isfinite())
-        surface, limit = depth_in(scenery.field, scenery.surfaces, frame, self._box(frame), self._standing)
+        surface, limit = depth_in(scenery.field, scenery.surfaces, frame, self._box(frame, states), self._standing)
         return Shot(image, frame.camera, frame.world_from_cam, surface, limit, look_of(image, gain))
 
-    def _box(self, frame: Frame) -> tuple[int, int, int, int]:
-        """Left, top, right, bottom of the part of a photo in which objects stand, before or after."""
-        items = (*self._plan.world.before.items, *self._plan.world.after.items)
+    def _box(self, frame: Frame, states: Sequence[State]) -> tuple[int, int, int, int]:
+        """Left, top, right, bottom of the part of a photo in which objects stand, in any of the states."""
+        items = [item for state in states for item in state.items]
         corners = torch.cat([torch.cartesian_prod(*item.box().T) for item in items])
         pixels, z = frame.camera.project(transform(invert(frame.world_from_cam), corners))
         if not bool((z > 0).all()):

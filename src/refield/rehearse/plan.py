@@ -26,6 +26,8 @@ HAPPENINGS = ("moved", "added", "removed", "several", "turned", "tipped", "nothi
 LARGEST, SMALLEST = 0.35, 0.10
 """of the picture's shorter side at that distance"""
 _TRIES = 60
+_THINGS = 3  # that stand there, where one state is changed in several ways
+_JOINED = 0.4  # of those changes something arrives as well
 _SHRINK, _LEAST = 0.85, 0.9
 _LEAST_TURN, _MOST_TURN = 25.0, 65.0  # degrees: a square looks the same again at 90
 _ROUND = 0.05  # of its reach from the upright: what turns by less of it looks as before
@@ -93,6 +95,46 @@ def is_round(solid: Solid) -> bool:
     return float(solid.distance(turned).max()) < _ROUND * reach
 
 
+def plans_of(sites: Sequence[Site], seed: int, count: int) -> list[Plan]:
+    """So many random changes of one and the same state with three objects, each of one to three of them, at the first
+    of the sites that has room.
+
+    Raises:
+        NoRoomError: there is no place that enough photos see, or no free one.
+    """
+    part = float(np.random.default_rng([seed, 17]).uniform(SMALLEST, LARGEST))
+    for site in sites:
+        smaller = part
+        while len(site.centres) and smaller >= _LEAST * SMALLEST:
+            stage = _Stage(site, np.random.default_rng([seed, 18]), [])
+            before = [stage.place(stage.drawn(f"object {k}", smaller * site.width, "turned")) for k in range(_THINGS)]
+            there = tuple(item for item in before if item is not None)
+            if len(there) == _THINGS:
+                state = State(there, np.zeros((1, 2, 3), np.float32))
+                light = _light(np.random.default_rng([seed, 19]), site, World("several", state, state))
+                return [_changed(stage, state, light, seed, k) for k in range(count)]
+            smaller *= _SHRINK
+    raise _no_room()
+
+
+def _changed(stage: _Stage, before: State, light: Light, seed: int, number: int) -> Plan:
+    """One change of a state: what has no room to go elsewhere leaves."""
+    stage = replace(stage, rng=np.random.default_rng([seed, 20, number]), taken=[*stage.taken])
+    rng = stage.rng
+    chosen = rng.permutation(_THINGS)[: 1 + number % _THINGS].tolist()
+    after, came = list[Item](), f"object {_THINGS + number}"
+    for k, item in enumerate(before.items):
+        doing = str(rng.choice([*_DOINGS, "removed"])) if k in chosen else "nothing"
+        now = _DOINGS[doing](stage, item) if doing in _DOINGS else (None if doing == "removed" else item)
+        after += [] if now is None else [now]
+    if rng.random() < _JOINED:
+        size = max(2 * max(item.solid.half) for item in before.items)
+        new = stage.place(stage.drawn(came, size, ""))
+        after += [] if new is None else [new]
+    world = World("random several", before, State(tuple(after), before.surroundings))
+    return Plan(world, stage.site, light, _facts(seed, "several", stage, world, light) | {"change": number})
+
+
 def plan_of(sites: Sequence[Site], seed: int) -> Plan:
     """A random rehearsal at the first of the sites that has room for it.
 
@@ -110,8 +152,12 @@ def plan_of(sites: Sequence[Site], seed: int) -> Plan:
                 light = _light(rng, site, world)
                 return Plan(world, site, light, _facts(seed, happening, stage, world, light))
             smaller *= _SHRINK
+    raise _no_room()
+
+
+def _no_room() -> NoRoomError:
     what = "there is no free place in it that a third of the photos and three of the four new ones show"
-    raise NoRoomError("the rehearsal", what, "photos that look at one place from many sides are needed")
+    return NoRoomError("the rehearsal", what, "photos that look at one place from many sides are needed")
 
 
 def _enacted(stage: _Stage, happening: str, size: float) -> World | None:
