@@ -213,30 +213,30 @@ def rehearsed(scenery: Scenery, folder: Path, seed: int, clock: Clock, options: 
         workspace = Workspace.open(work)
         if workspace.visits:
             take_back(workspace)
-        one = _updated(place, work, (seed, psnr), clock, options.placed)
-        yield replace(one, seconds=clock.total - began, number=number if several else None)
+        visit, refused = _updated(place, work, clock, options.placed)
+        yield Rehearsed(
+            seed,
+            read_json(place / "truth" / "world.json"),
+            psnr,
+            None if visit is None else score_change(visit.change, load_change(place / "truth", masks=False)),
+            None if visit is None else _numbers(visit.evaluation),
+            refused,
+            clock.total - began,
+            number if several else None,
+        )
         began = clock.total
 
 
-def _updated(place: Path, work: Path, of: tuple[int, float], clock: Clock, placed: bool) -> Rehearsed:
-    """What an update of a workspace by the new photos of a change tells, and how well it shows them.
-
-    Args:
-        of: the rehearsal's seed, and the PSNR of the field, dB.
-    """
+def _updated(place: Path, work: Path, clock: Clock, placed: bool) -> tuple[Visit | None, str]:
+    """The update of a workspace by the new photos of a change; None and why, if it was refused."""
     photos = place / "after" if placed else place / "after" / "images"
-    visit: Visit | None = None
-    refused = ""
     try:
-        visit = update(Update(work, photos, evaluation=place / "eval"), clock)
+        return update(Update(work, photos, evaluation=place / "eval"), clock), ""
     except InputError as error:
-        refused = str(error)
-        clock.warn(f"the update was refused: {refused}")
-    clock.stop()
-    truth = load_change(place / "truth", masks=False)
-    score = None if visit is None else score_change(visit.change, truth)
-    evaluation = None if visit is None else _numbers(visit.evaluation)
-    return Rehearsed(of[0], read_json(place / "truth" / "world.json"), of[1], score, evaluation, refused, 0.0)
+        clock.warn(f"the update was refused: {error}")
+        return None, str(error)
+    finally:
+        clock.stop()
 
 
 def _numbers(report: Report | None) -> Report | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ HAPPENINGS = ("moved", "added", "removed", "several", "turned", "tipped", "nothi
 """what seed N does is the N-th of these, round and round"""
 LARGEST, SMALLEST = 0.35, 0.10
 """of the picture's shorter side at that distance"""
+_T = TypeVar("_T")
 _TRIES = 60
 _THINGS = 3  # that stand there, where one state is changed in several ways
 _JOINED = 0.4  # of those changes something arrives as well
@@ -103,18 +104,16 @@ def plans_of(sites: Sequence[Site], seed: int, count: int) -> list[Plan]:
         NoRoomError: there is no place that enough photos see, or no free one.
     """
     part = float(np.random.default_rng([seed, 17]).uniform(SMALLEST, LARGEST))
-    for site in sites:
-        smaller = part
-        while len(site.centres) and smaller >= _LEAST * SMALLEST:
-            stage = _Stage(site, np.random.default_rng([seed, 18]), [])
-            before = [stage.place(stage.drawn(f"object {k}", smaller * site.width, "turned")) for k in range(_THINGS)]
-            there = tuple(item for item in before if item is not None)
-            if len(there) == _THINGS:
-                state = State(there, np.zeros((1, 2, 3), np.float32))
-                light = _light(np.random.default_rng([seed, 19]), site, World("several", state, state))
-                return [_changed(stage, state, light, seed, k) for k in range(count)]
-            smaller *= _SHRINK
-    raise _no_room()
+    stage, state = _staged(sites, (seed, 18), part, _things)
+    light = _light(np.random.default_rng([seed, 19]), stage.site, World("several", state, state))
+    return [_changed(stage, state, light, seed, k) for k in range(count)]
+
+
+def _things(stage: _Stage, size: float) -> State | None:
+    """Objects any of which can be turned; None where there is no room for all."""
+    items = [stage.place(stage.drawn(f"object {k}", size, "turned")) for k in range(_THINGS)]
+    there = tuple(item for item in items if item is not None)
+    return State(there, np.zeros((1, 2, 3), np.float32)) if len(there) == len(items) else None
 
 
 def _changed(stage: _Stage, before: State, light: Light, seed: int, number: int) -> Plan:
@@ -122,14 +121,16 @@ def _changed(stage: _Stage, before: State, light: Light, seed: int, number: int)
     stage = replace(stage, rng=np.random.default_rng([seed, 20, number]), taken=[*stage.taken])
     rng = stage.rng
     chosen = rng.permutation(_THINGS)[: 1 + number % _THINGS].tolist()
-    after, came = list[Item](), f"object {_THINGS + number}"
+    after: list[Item] = []
     for k, item in enumerate(before.items):
-        doing = str(rng.choice([*_DOINGS, "removed"])) if k in chosen else "nothing"
-        now = _DOINGS[doing](stage, item) if doing in _DOINGS else (None if doing == "removed" else item)
+        now: Item | None = item
+        if k in chosen:
+            doing = str(rng.choice([*_DOINGS, "removed"]))
+            now = _DOINGS[doing](stage, item) if doing in _DOINGS else None
         after += [] if now is None else [now]
     if rng.random() < _JOINED:
         size = max(2 * max(item.solid.half) for item in before.items)
-        new = stage.place(stage.drawn(came, size, ""))
+        new = stage.place(stage.drawn(f"object {_THINGS + number}", size, ""))
         after += [] if new is None else [new]
     world = World("random several", before, State(tuple(after), before.surroundings))
     return Plan(world, stage.site, light, _facts(seed, "several", stage, world, light) | {"change": number})
@@ -143,21 +144,32 @@ def plan_of(sites: Sequence[Site], seed: int) -> Plan:
     """
     rng = np.random.default_rng([seed, 11])
     happening, part = HAPPENINGS[seed % len(HAPPENINGS)], float(rng.uniform(SMALLEST, LARGEST))
+    stage, world = _staged(sites, (seed, 13), part, lambda stage, size: _enacted(stage, happening, size))
+    light = _light(rng, stage.site, world)
+    return Plan(world, stage.site, light, _facts(seed, happening, stage, world, light))
+
+
+def _staged(
+    sites: Sequence[Site], seed: Sequence[int], part: float, enacted: Callable[[_Stage, float], _T | None]
+) -> tuple[_Stage, _T]:
+    """What is enacted at the first of the sites that has room for it, with smaller and smaller objects.
+
+    Args:
+        part: of the picture's shorter side, how large the objects are at first.
+
+    Raises:
+        NoRoomError: there is no place that enough photos see, or no free one.
+    """
     for site in sites:
         smaller = part
         while len(site.centres) and smaller >= _LEAST * SMALLEST:
-            stage = _Stage(site, np.random.default_rng([seed, 13]), [])
-            world = _enacted(stage, happening, smaller * site.width)
-            if world is not None:
-                light = _light(rng, site, world)
-                return Plan(world, site, light, _facts(seed, happening, stage, world, light))
+            stage = _Stage(site, np.random.default_rng(seed), [])
+            found = enacted(stage, smaller * site.width)
+            if found is not None:
+                return stage, found
             smaller *= _SHRINK
-    raise _no_room()
-
-
-def _no_room() -> NoRoomError:
     what = "there is no free place in it that a third of the photos and three of the four new ones show"
-    return NoRoomError("the rehearsal", what, "photos that look at one place from many sides are needed")
+    raise NoRoomError("the rehearsal", what, "photos that look at one place from many sides are needed")
 
 
 def _enacted(stage: _Stage, happening: str, size: float) -> World | None:
