@@ -95,11 +95,4 @@ def _disagree(seen: Sequence[tuple[Array, Array]], labs: Sequence[Array]) -> Mas
 
 def _nearest(lab: Array, at: Array, other: Array, there: Array) -> Array:
     """Distance (K,) of a pixel's colour to the most similar one around a pixel of another photo."""
-    h, w = other.shape[:2]
-    colour = lab[at[:, 1], at[:, 0]]
-    best = np.full(len(at), np.inf, np.float32)
-    for dy in (-1, 0, 1):
-        for dx in (-1, 0, 1):
-            i, j = np.clip(there[:, 1] + dy, 0, h - 1), np.clip(there[:, 0] + dx, 0, w - 1)
-            best = np.minimum(best, np.linalg.norm(colour - other[i, j], axis=-1))
-    return best
+    return pixels.nearest_distance(lab[at[:, 1], at[:, 0]], other, there[:, 1], there[:, 0])

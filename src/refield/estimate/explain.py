@@ -80,7 +80,7 @@ def relit(p: Compared, sigma: float) -> Array:
     """The composite with each side's smooth light taken from the photo: what turned is lit anew."""
     seen, shown = to_linear(p.photo), to_linear(np.maximum(p.composite, 0))
     ratio = np.zeros_like(shown)
-    for side in range(int(p.sides.max(initial=-1)) + 1):
+    for side in np.unique(p.sides[p.sides >= 0]):
         here = p.sides == side
         weight = here[..., None].astype(np.float32)
         dark = DARK / 3 * pixels.blur(weight, sigma)[..., None] + 1e-6

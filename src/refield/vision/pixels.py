@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from refield.vision.pixel_kernels import find_nearest
+
 Image = NDArray[Any]
 Mask = NDArray[Any]
 
@@ -44,15 +46,17 @@ def colour_difference(a: Image, b: Image, reach: int = 1) -> Image:
     return np.maximum(_nearest_distance(lab_a, lab_b, reach), _nearest_distance(lab_b, lab_a, reach))
 
 
+def nearest_distance(colours: Image, image: Image, rows: Image, columns: Image, reach: int = 1) -> Image:
+    """Distance of each colour (K, 3) to the most similar one of an image's within ``reach`` pixels of a place, (K,);
+    rows, columns: (K,) int64. An image goes on beyond its border as it is there."""
+    out = np.empty(len(colours), np.float32)
+    find_nearest(np.ascontiguousarray(colours), np.ascontiguousarray(image), rows, columns, reach, out)
+    return out
+
+
 def _nearest_distance(a: Image, b: Image, reach: int) -> Image:
-    h, w = a.shape[:2]
-    padded = cv2.copyMakeBorder(b, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
-    best = np.full((h, w), np.inf, np.float32)
-    for dy in range(2 * reach + 1):
-        for dx in range(2 * reach + 1):
-            step = a - padded[dy : dy + h, dx : dx + w]
-            best = np.minimum(best, np.einsum("hwc,hwc->hw", step, step))
-    return np.sqrt(best)
+    rows, columns = np.indices(a.shape[:2]).reshape(2, -1)
+    return nearest_distance(a.reshape(-1, 3), b, rows, columns, reach).reshape(a.shape[:2])
 
 
 def median(images: Image) -> Image:
