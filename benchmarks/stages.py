@@ -29,7 +29,6 @@ from torch import Tensor
 from refield.estimate import fit, recipe
 from refield.estimate.detect import Changed
 from refield.estimate.hull import Hull
-from refield.estimate.lattice import Voxels
 from refield.estimate.pose_change import PoseChange
 from refield.estimate.register import Candidate
 from refield.field.radiance import Field
@@ -62,7 +61,7 @@ class Stages:
     after: Field
     change: SceneChange
     changed: Sequence[Changed]
-    carved: tuple[Hull, Voxels]
+    carved: list[Hull]
     """and the voxels in front of what holds things up"""
     candidates: Sequence[Candidate]
     refined: PoseChange
@@ -175,9 +174,9 @@ def detected(s: Stages) -> list[Tile]:
 
 
 def carved(s: Stages) -> list[Tile]:
-    hull, free = s.carved
-    held, centres = hull.hull & free, hull.lattice.centres
-    was, now = centres[held & hull.solid], centres[held & ~hull.solid]
+    held = [(h.lattice.centres, h.hull & h.free, h.solid) for h in s.carved]
+    was = np.concatenate([at[inside & solid] for at, inside, solid in held])
+    now = np.concatenate([at[inside & ~solid] for at, inside, solid in held])
     first, other = s.changed[0], s.changed[2]
     return [
         ("where something was", voxels(first, was, OUT_COLOUR)),

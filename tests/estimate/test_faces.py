@@ -9,6 +9,7 @@ from refield.estimate.faces import changed_parts
 from refield.estimate.hull import HullConfig, carve
 from refield.estimate.lattice import Lattice
 from refield.estimate.look import view_of
+from refield.scene.planes import Plane
 from refield.vision.segmenter import GrabCutSegmenter
 from tests.estimate.boxes import BoxWorld, camera_at, photograph, standing
 
@@ -31,23 +32,27 @@ def parts_of(views, masks):
     blank = np.zeros(views[0].shape)
     changed = [Changed(v, blank, blank, m, *np.zeros((2, *m.shape), bool)) for v, m in zip(views, masks)]
     lattice = Lattice.over(np.array([-0.7, -0.5, -0.05], np.float32), np.array([0.8, 0.8, 0.7], np.float32), 60)
-    carved = carve(lattice, list(zip(views, masks)), views, HullConfig())
-    above = lattice.centres[..., 2] > 0.01
-    return lattice, changed_parts(changed, carved, above, HullConfig(smallest=20), GrabCutSegmenter())
+    floor = Plane(np.array([0, 0, 1], np.float32), 0.0, 0.01)
+    carved = carve(lattice, list(zip(views, masks)), views, [floor], HullConfig())
+    return changed_parts(changed, [carved], HullConfig(smallest=20), GrabCutSegmenter())
+
+
+def share_in(box, part):
+    return float(box.inside(torch.from_numpy(part.body.places)).float().mean())
 
 
 def test_two_things_that_changed_are_two_parts(views):
-    lattice, parts = parts_of(views, [shown(v, CRATE) | shown(v, DRUM) for v in views])
+    parts = parts_of(views, [shown(v, CRATE) | shown(v, DRUM) for v in views])
     for box in (CRATE, DRUM):
-        mine = [t for t in parts.things if box.inside(torch.from_numpy(lattice.centres[t])).float().mean() > 0.7]
-        assert len(mine) == 1 and mine[0].sum() * lattice.cell**3 > 0.5 * 8 * float(np.prod(box.half))
+        mine = [t for t in parts.things if share_in(box, t) > 0.7]
+        assert len(mine) == 1 and mine[0].body.volume > 0.5 * 8 * float(np.prod(box.half))
 
 
 def test_a_part_of_what_goes_on_outside_of_the_mask_is_no_thing(views):
     """A newcomer hides a strip of the drum from every side; the crate left."""
     strip = [shown(v, DRUM) & (v.surface[..., 2] > 0.1) & (v.surface[..., 2] < 0.3) for v in views]
-    lattice, parts = parts_of(views, [shown(v, CRATE) | s for v, s in zip(views, strip)])
-    inside = CRATE.inside(torch.from_numpy(lattice.centres[parts.things[0]])).float().mean()
-    assert inside > 0.7
-    (hidden,) = [p for p in parts.others if DRUM.inside(torch.from_numpy(lattice.centres[p])).float().mean() > 0.7]
-    assert parts.where[parts.things[0]].mean() > 0.8 and parts.where[hidden].mean() < 0.1
+    parts = parts_of(views, [shown(v, CRATE) | s for v, s in zip(views, strip)])
+    thing = parts.things[0]
+    assert share_in(CRATE, thing) > 0.7
+    (hidden,) = [p for p in parts.others if share_in(DRUM, p) > 0.7]
+    assert thing.where[thing.voxels].mean() > 0.8 and hidden.where[hidden.voxels].mean() < 0.1

@@ -9,7 +9,7 @@ import torch
 
 from refield.estimate import associate
 from refield.estimate.detect import Changed
-from refield.estimate.hull import HullConfig, find_region
+from refield.estimate.hull import HullConfig, carve, find_regions
 from refield.estimate.lattice import Lattice, components
 from refield.estimate.look import median_depth, view_of
 from refield.field.volrend import Samples
@@ -34,7 +34,30 @@ def true_mask(view):
 
 def test_no_mask_no_region(views):
     nothing = np.zeros(views[0].shape, bool)
-    assert find_region([Changed(v, nothing, nothing, nothing, nothing, nothing) for v in views], HullConfig()) is None
+    changed = [Changed(v, nothing, nothing, nothing, nothing, nothing) for v in views]
+    assert find_regions(changed, HullConfig(), 0.0) == []
+
+
+SMALL = standing((0.06, 0.05, 0.08), 0.55, 0.45, 0, paint=3)
+
+
+def test_a_small_thing_beside_a_large_one_has_voxels_of_its_own(tmp_path):
+    world = BoxWorld((CRATE, SMALL))
+    frames = photograph(world, tmp_path, [camera_at(20 + 90 * k, 34) for k in range(4)])
+    views = [view_of(world, f, 10_000) for f in frames]
+    inward = [torch.nan_to_num(torch.from_numpy(v.surface + 0.01 * v.directions)) for v in views]
+    shown = [(CRATE.inside(p) | SMALL.inside(p)).numpy() & np.isfinite(v.depth) for v, p in zip(views, inward)]
+    blank = np.zeros(views[0].shape)
+    changed = [Changed(v, blank, blank, m, *np.zeros((2, *m.shape), bool)) for v, m in zip(views, shown)]
+    config, seen = HullConfig(), list(zip(views, shown))
+    hulls = [carve(place, seen, views, (), config) for place in find_regions(changed, config, 0.003)]
+    for box in (CRATE, SMALL):
+        mine = [h for h in hulls if box.inside(torch.from_numpy(h.lattice.centres[h.hull])).any()]
+        assert len(mine) == 1
+        inside = box.inside(torch.from_numpy(mine[0].lattice.centres)).numpy()
+        assert inside.sum() > 40 and mine[0].hull[inside].mean() > 0.9
+    larger = max(float(m.mean()) for m in shown)
+    assert find_regions(changed, config, 1.1 * larger) == []  # nothing is as large as that
 
 
 def test_the_floor_holds_up_and_the_lid_does_not(views):
@@ -81,9 +104,19 @@ def test_a_view_finds_its_own_surface_again(views):
     assert replace(view, depth=view.depth).surface.shape == (*view.shape, 3)
 
 
-@pytest.mark.parametrize(("seen", "crumb"), [((2, 0), True), ((2, 5), False)])
-def test_a_crumb_is_small_in_every_photo(monkeypatch, seen, crumb):
-    sizes = iter(seen)
+@pytest.mark.parametrize(
+    ("shown", "apart", "crumb"),
+    [
+        ((3, 3), 1.5, False),  # as much as the price in either
+        ((3, 0), 1.5, False),  # a photo that does not show it costs nothing
+        ((3, 3), 0.5, True),  # not changed by as much as counts
+        ((2, 2), 1.5, True),  # too small
+        ((2, 2), 6.0, False),  # small, and plainly not there
+    ],
+)
+def test_a_crumb_is_what_would_not_pay_for_a_body(monkeypatch, shown, apart, crumb):
+    """Of photos of 1000 pixels, of which a body must explain 2.7 that are as wrong as a pose may be."""
+    sizes = iter(shown)
 
     def silhouette(view, old):
         mask = np.zeros((10, 100), bool)
@@ -91,8 +124,9 @@ def test_a_crumb_is_small_in_every_photo(monkeypatch, seen, crumb):
         return mask
 
     monkeypatch.setattr(associate, "silhouette", silhouette)
-    photos = [SimpleNamespace(view=None)] * 2
-    assert associate.is_crumb(photos, None, 0.003) is crumb
+    ground = SimpleNamespace(believe=SimpleNamespace(smallest=0.003))
+    of_photo = SimpleNamespace(view=None, difference=np.full((10, 100), apart), threshold=np.ones((10, 100)))
+    assert associate.is_crumb(ground, [of_photo] * 2, None) is crumb
 
 
 def table_and_floor(count=4000, seed=0):

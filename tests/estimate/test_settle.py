@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from refield.estimate import fit, recipe, rotations, settle
-from refield.estimate.lattice import Body, grown, some_of
+from refield.estimate.lattice import Body, Lattice, grown, some_of
 from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of
+from refield.estimate.outline import restricted
 from refield.scene.pose import angle_between, transform
 from refield.scene.srgb import to_linear, to_srgb
 from refield.vision import pixels
@@ -59,7 +60,8 @@ def test_the_truth_leaves_less_unexplained_than_any_other_hypothesis(capture, tm
         return replace(found, moved={k: placed[0][1]}, views=tuple(views))
 
     def came() -> Settled:
-        lattice = ground.hull.lattice
+        there = transform(AWAY, torch.from_numpy(old.lattice.centres[old.voxels]).double()).numpy()
+        lattice = Lattice.over(there.min(0), there.max(0), 60)
         back = transform(torch.linalg.inv(AWAY), torch.from_numpy(lattice.centres).double()).numpy()
         there = old.lattice.holds(grown(old.voxels, 1), back.astype(np.float32))
         views = tuple(settle.without(ground, changed, [old]))
@@ -92,7 +94,7 @@ def test_the_lead_of_an_object_that_no_other_answer_was_tried_for_is_endless(cap
 def test_a_newcomer_that_explains_nothing_is_taken_back(capture, tmp_path, monkeypatch):
     """What the photos show as it was is dear to call new; what they show of a newcomer is cheap."""
     _, (ground, _olds, _changed, found) = settled(capture, tmp_path, monkeypatch)
-    lattice = ground.hull.lattice
+    lattice = max((h.lattice for h in ground.hulls), key=lambda one: one.centres.size)
     low, high = lattice.centres.reshape(-1, 3).min(0), lattice.centres.reshape(-1, 3).max(0)
     corner = (lattice.centres < low + 0.15 * (high - low)).all(-1)
     bare = replace(found, moved={}, removed={})
@@ -110,6 +112,25 @@ def test_a_newcomer_that_gains_less_than_the_smallest_thing_would_is_none(captur
     nothing, less = judged(ground, bare)[1], judged(ground, replace(bare, arrived=(whole,)))
     assert less[1] < nothing and less[0].arrived == (whole,)
     assert judged(ground, replace(bare, arrived=(speck,))) == judged(ground, bare)
+
+
+def test_two_that_went_the_same_way_are_one(capture, tmp_path, monkeypatch):
+    """An outline may be cut where nothing is: what moved along is of the thing."""
+    _, (ground, _, changed, found) = settled(capture, tmp_path, monkeypatch)
+    ground = replace(ground, believe=replace(ground.believe, smallest=0.01))  # to be outlined anew costs less
+    (k,) = found.moved
+    old, change = found.olds[k], found.moved[k]
+    left = old.lattice.centres[..., 0] < old.centre[0]
+    halves = [restricted(old, old.voxels & side, ground.shape) for side in (left, ~left)]
+    apart = settle._completed(ground, dict(enumerate(halves)), [0, 1], changed, {0: change, 1: change})
+    assert len(apart.moved) == 2
+    search = settle.Search(ground, changed)
+    (joined,) = search._joined(apart, 0)
+    ((_, whole),) = [(j, joined.olds[j]) for j in joined.moved]
+    assert all(half.within(whole) for half in halves)
+    assert judged(ground, joined)[1] < judged(ground, apart)[1]
+    elsewhere = replace(change, new_from_old=AWAY @ change.new_from_old)
+    assert list(search._joined(replace(apart, moved={0: change, 1: elsewhere}), 0)) == []
 
 
 def test_what_only_darkens_all_that_is_behind_it_is_no_newcomer(capture, tmp_path, monkeypatch):
@@ -168,7 +189,7 @@ def test_a_small_thing_among_much_that_changed_is_carved_finely(capture, tmp_pat
     """On a lattice that holds everything that differs it has too few voxels to be told from a speck."""
     tin = standing((0.09, 0.08, 0.1), 0.5, 0.45, 10, paint=8)
     frames = new_photos(BoxWorld((CRATE.moved(AWAY), tin)), tmp_path)
-    coarse = replace(CONFIG, hull=replace(CONFIG.hull, longest=20))
+    coarse = replace(CONFIG, hull=replace(CONFIG.hull, longest=32))
     change = recipe.estimate_change(capture, BEFORE, frames, coarse)
     assert sorted(o.kind for o in change.objects) == ["added", "moved"]
     (added,) = (o for o in change.objects if o.kind == "added")

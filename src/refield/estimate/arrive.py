@@ -12,11 +12,12 @@ from scipy import ndimage
 from torch import Tensor
 
 from refield.estimate.consist import colours_of_others
+from refield.estimate.cost import CAME, price, wrongness
 from refield.estimate.detect import Mask, difference
 from refield.estimate.explain import LIMIT
 from refield.estimate.ground import Ground
 from refield.estimate.hull import HullConfig, look_behind, votes
-from refield.estimate.lattice import EVERY_WAY, Body, Lattice, Voxels, components, grown
+from refield.estimate.lattice import EVERY_WAY, Body, Lattice, Voxels, components, grown, some_of
 from refield.estimate.light import Ratio, brighter, light_of_others
 from refield.estimate.look import Array, View
 from refield.estimate.objects import Old
@@ -25,17 +26,18 @@ from refield.estimate.past import Past
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
-CAME = 0.7
-"""what a pixel costs that may show anything, since something came there"""
 _NEARLY_ALL = 0.95  # of a would-be newcomer's pixels
 
 
-def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> Voxels:
-    """Voxels of the hull that newcomers may fill: in every seeing view's unexplained change, and empty once the old are
-    gone."""
-    hull = ground.hull
-    empty = _empty(hull.lattice, ~hull.solid, olds) & ground.free
-    return empty & _new(hull.lattice, past, ground.carving, ground.carving.margin)
+def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list[Body]:
+    """Connected voxels of the hull that newcomers may fill: in every seeing view's unexplained change, and empty once
+    the old are gone."""
+    out = []
+    for hull in ground.hulls:
+        empty = Body(hull.lattice, _empty(hull.lattice, ~hull.solid, olds) & hull.free)
+        there = _new(empty, past, ground.carving, ground.carving.margin)
+        out += [Body(hull.lattice, part) for part in components(there.voxels, 1)]
+    return out
 
 
 def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list[Body]:
@@ -44,7 +46,7 @@ def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list
     Each is carved on a lattice of its own: on the hull's, which holds everything, a small thing has few voxels.
     """
     out, open_ = list[Body](), [p.open & p.changed.certain for p in past]
-    some = [Body(ground.hull.lattice, part) for part in components(arrivals(ground, past, olds), 1)]
+    some = arrivals(ground, past, olds)
     some = [body for body in some if any(_speaks(ground, s & o) for s, o in zip(shadows_of(past, body), open_))]
     left = [(b, shadows_of(past, b)) for body in some for b in _thick(ground, _finer(ground, body, past, olds))]
     light = cache(partial(_lit, ground, past))
@@ -62,8 +64,8 @@ def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list
 
 def exactly(ground: Ground, body: Body, past: Sequence[Past]) -> Body:
     """A newcomer without what lies beside the photos' masks, by which it was carved with a margin."""
-    inside = body.voxels & _new(body.lattice, past, ground.carving, 0)
-    return replace(body, voxels=inside) if inside.any() else body
+    inside = _new(body, past, ground.carving, 0)
+    return inside if inside.voxels.any() else body
 
 
 def _finer(ground: Ground, coarse: Body, past: Sequence[Past], olds: Sequence[Old]) -> Body:
@@ -74,7 +76,7 @@ def _finer(ground: Ground, coarse: Body, past: Sequence[Past], olds: Sequence[Ol
     through, _ = look_behind(lattice.centres.reshape(-1, 3), [*ground.survey, *(p.view for p in past)], config)
     voxels = free_voxels(lattice, ground.planes) & coarse.lattice.holds(grown(coarse.voxels, 1), lattice.centres)
     voxels &= _empty(lattice, through.reshape(lattice.shape), olds)
-    return Body(lattice, voxels & _new(lattice, past, config, config.margin))
+    return _new(Body(lattice, voxels), past, config, config.margin)
 
 
 def _empty(lattice: Lattice, air: Voxels, olds: Sequence[Old]) -> Voxels:
@@ -84,14 +86,14 @@ def _empty(lattice: Lattice, air: Voxels, olds: Sequence[Old]) -> Voxels:
     return air
 
 
-def _new(lattice: Lattice, past: Sequence[Past], config: HullConfig, margin: int) -> Voxels:
-    """Voxels in every seeing view's unexplained change, grown by ``margin`` pixels."""
-    flat = lattice.centres.reshape(-1, 3)
+def _new(body: Body, past: Sequence[Past], config: HullConfig, margin: int) -> Body:
+    """A body's voxels in every seeing view's unexplained change, grown by ``margin`` pixels."""
     seen = [(p.changed.witness(p.depth), p.changed.mask & ~p.explained) for p in past]
-    inside, against = votes(flat, [(v, pixels.dilate(m, margin)) for v, m in seen], config)
-    sure, _ = votes(flat, [(v, pixels.dilate(p.open, margin)) for (v, _), p in zip(seen, past)], config)
+    inside, against = votes(body.places, [(v, pixels.dilate(m, margin)) for v, m in seen], config)
+    sure, _ = votes(body.places, [(v, pixels.dilate(p.open, margin)) for (v, _), p in zip(seen, past)], config)
     needed = min(2, len(past))
-    return ((inside >= needed) & (sure >= needed) & (against == 0)).reshape(lattice.shape)
+    which = (inside >= needed) & (sure >= needed) & (against == 0)
+    return replace(body, voxels=some_of(body.voxels, which))
 
 
 def _thick(ground: Ground, body: Body) -> list[Body]:
@@ -115,14 +117,17 @@ def remarkable(
     ground: Ground, parts: Sequence[Body], past: Sequence[Past], places: Sequence[tuple[Old, Tensor]]
 ) -> list[Body]:
     """Would-be newcomers that are no scraps at the edges of objects."""
-    large = [p for p in parts if _substantial(ground, p, past)]
-    return [p for p in large if not any(_rim_of(p, old, place) for old, place in places)]
+    some = [p for p in parts if _may_pay(ground, p, past)]
+    return [p for p in some if not any(_rim_of(p, old, place) for old, place in places)]
 
 
-def _substantial(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
-    """Whether a would-be newcomer is large enough in some photo; what is left over at the edge of others is not."""
-    shadows = shadows_of(past, part)
-    return max(float((s & p.open).mean()) for s, p in zip(shadows, past)) >= ground.believe.smallest
+def _may_pay(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
+    """Whether a would-be newcomer may explain what it costs, if all that it does not hide is right."""
+    shadows, gain = shadows_of(past, part), 0.0
+    for here, p in zip(shadows, past):
+        wrong = wrongness(p.difference, p.changed.threshold)
+        gain += float((wrong - CAME)[here & p.known & ~p.changed.new].sum())
+    return gain > price(shadows, ground.believe.smallest)
 
 
 def _rim_of(part: Body, old: Old, new_from_old: Tensor) -> bool:
@@ -177,7 +182,7 @@ def _only_light(
     things = colours_of_others(part, [(p.view, h) for p, h in zip(past, here)])
     both = [a & np.isfinite(thing[..., 0]) for a, thing in zip(asked, things)]
     shown = [_shows(ground, p, np.where(b[..., None], thing, p.view.photo)) for p, thing, b in zip(past, things, both)]
-    return _count(both, alike) > _count(both, shown) - least_gain(ground, past)
+    return _count(both, alike) > _count(both, shown) - price(shadows, ground.believe.smallest)
 
 
 def _count(some: Sequence[Mask], others: Sequence[Mask]) -> int:
@@ -188,11 +193,6 @@ def _count(some: Sequence[Mask], others: Sequence[Mask]) -> int:
 def _shows(ground: Ground, p: Past, picture: Array) -> Mask:
     """Pixels of a photo that show what a picture (H, W, 3) does."""
     return difference(p.view, picture, ground.detect) < LIMIT * p.changed.threshold
-
-
-def least_gain(ground: Ground, past: Sequence[Past]) -> float:
-    """Pixels that a newcomer must explain, over all photos: what the smallest thing in all of them would."""
-    return (1 - CAME) * ground.believe.smallest * sum(p.changed.mask.size for p in past)
 
 
 def fresh(past: Sequence[Past], body: Body) -> float:

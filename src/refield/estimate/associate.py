@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from refield.estimate.arrive import newcomers, remarkable
+from refield.estimate.cost import price, wrongness
 from refield.estimate.detect import Changed
 from refield.estimate.fit import Fit, cut_of, fit_again, fit_of, is_among, is_certain, left_by
 from refield.estimate.ground import Ground
@@ -28,13 +29,17 @@ from refield.vision import pixels
 
 def may_have_changed(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
     """Whether an object is to be looked for elsewhere: its pixels changed, and it is no crumb, unless it is known."""
-    crumb = not old.remembered and is_crumb(changed, old, ground.believe.smallest)
-    return not crumb and changed_share(changed, old) >= ground.believe.touched
+    if not old.remembered and is_crumb(ground, changed, old):
+        return False
+    return changed_share(without(ground, changed, [old]), old) >= ground.believe.touched
 
 
-def is_crumb(changed: Sequence[Changed], old: Old, least: float) -> bool:
-    """Whether an object fills less than this part of every photo: it is rather the edge of something else."""
-    return max(float(silhouette(c.view, old).mean()) for c in changed) < least
+def is_crumb(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
+    """Whether what is wrong where an object was is less than it would cost that it left: it is rather the edge of
+    something else."""
+    shown = [silhouette(c.view, old) for c in changed]
+    wrong = sum(float(wrongness(c.difference, c.threshold)[s].sum()) for c, s in zip(changed, shown))
+    return wrong <= price(shown, ground.believe.smallest)
 
 
 def without(

@@ -7,7 +7,7 @@ left is all inside the changed pixels, while what is behind the newcomer goes on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from refield.estimate.detect import Changed, Mask
 from refield.estimate.hull import Hull, HullConfig, votes
-from refield.estimate.lattice import Lattice, Voxels, components, grown
+from refield.estimate.lattice import Body, Lattice, Voxels, components, grown
 from refield.estimate.look import Array, View
 from refield.vision import pixels
 from refield.vision.segmenter import Segmenter, cut_out
@@ -28,49 +28,70 @@ _SHARED = 0.3  # of the smaller of two faces' voxels, for them to be one
 
 
 @dataclass(frozen=True)
-class Parts:
-    """What is solid in the change hull, in parts, the largest first."""
+class Part:
+    """A solid part of the change hull."""
 
-    things: list[Voxels]
-    """those that look like things"""
-    others: list[Voxels]
-    """those that go on outside of the changed pixels"""
+    carved: Hull
+    voxels: Voxels
     where: Voxels
     """voxels at which, or before which, most views show a thing, and none shows anything else"""
 
+    @property
+    def body(self) -> Body:
+        return Body(self.carved.lattice, self.voxels)
 
-def changed_parts(
-    changed: Sequence[Changed], carved: Hull, free: Voxels, config: HullConfig, segmenter: Segmenter
-) -> Parts:
+
+@dataclass(frozen=True)
+class Parts:
+    """What is solid in the change hull, in parts, the largest first."""
+
+    things: list[Part]
+    """those that look like things"""
+    others: list[Part]
+    """those that go on outside of the changed pixels"""
+
+
+def changed_parts(changed: Sequence[Changed], hulls: Sequence[Hull], config: HullConfig, segmenter: Segmenter) -> Parts:
     """Solid parts of the change hull.
 
-    Each has one surface and reaches no deeper behind it than that is wide. ``free``: voxels in front of what holds
-    things up.
+    Each has one surface and reaches no deeper behind it than that is wide.
     """
-    lattice = carved.lattice
-    solid = carved.hull & carved.solid & free
     marked = [_things_in(c, segmenter) for c in changed]
+    found = [_parts_in(carved, changed, marked, config) for carved in hulls]
+
+    def sorted_(parts: Iterable[list[Part]]) -> list[Part]:
+        return sorted((p for some in parts for p in some), key=lambda p: p.body.volume, reverse=True)
+
+    return Parts(sorted_(things for things, _ in found), sorted_(others for _, others in found))
+
+
+def _parts_in(
+    carved: Hull, changed: Sequence[Changed], marked: Sequence[Mask], config: HullConfig
+) -> tuple[list[Part], list[Part]]:
+    """One place's solid parts: those that look like things, and the others."""
+    lattice = carved.lattice
+    solid = carved.hull & carved.solid & carved.free
     own = _joined([f for c, t in zip(changed, marked) for f in _faces_in(c.view, c.mask & t, lattice, solid)])
     behind = _joined([f for c, t in zip(changed, marked) for f in _faces_in(c.view, c.mask & ~t, lattice, solid)])
     faces = own + behind
     if not faces:
-        return Parts([], [], np.zeros(lattice.shape, bool))
+        return [], []
     label = np.zeros(lattice.shape, np.int32)
     for k, face in enumerate(faces, start=1):
         label[face & (label == 0)] = k
     (box,) = ndimage.find_objects(solid.astype(np.int8))  # the faces lie in it, and nothing else is asked for
     nearest = ndimage.distance_transform_edt(label[box] == 0, return_distances=False, return_indices=True)
     label[box] = label[box][tuple(nearest)]
-    things: list[Voxels] = []
-    others: list[Voxels] = []
+    things: list[Part] = []
+    others: list[Part] = []
     where = _where(lattice.centres.reshape(-1, 3), changed, marked, config).reshape(lattice.shape)
     for k, face in enumerate(faces, start=1):
         at = lattice.centres[face]
         width = float((at.max(0) - at.min(0)).max()) + lattice.cell
         mine = solid & (label == k) & (carved.behind < width)
         parts = [p for p in components(mine, config.smallest) if (p & face).any()]
-        (things if k <= len(own) else others).extend(parts)
-    return Parts(sorted(things, key=np.sum, reverse=True), sorted(others, key=np.sum, reverse=True), where)
+        (things if k <= len(own) else others).extend(Part(carved, voxels, where) for voxels in parts)
+    return things, others
 
 
 def _where(points: Array, changed: Sequence[Changed], marked: Sequence[Mask], config: HullConfig) -> Mask:

@@ -11,7 +11,6 @@ from refield.estimate.detail import Detail
 from refield.estimate.detect import Changed, DetectConfig
 from refield.estimate.hull import Hull, HullConfig
 from refield.estimate.kept import Kept
-from refield.estimate.lattice import Voxels
 from refield.estimate.look import Array, Seen, View
 from refield.estimate.memory import Memory
 from refield.estimate.objects import Old
@@ -66,9 +65,8 @@ class Ground:
     """What every attempt shares."""
 
     field: Field
-    hull: Hull
-    free: Voxels
-    """voxels on the hull's lattice in front of whatever holds things up"""
+    hulls: Sequence[Hull]
+    """the carved change, place by place"""
     up: Array
     """(3,) the support's normal"""
     planes: Sequence[Plane]

@@ -12,36 +12,40 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from refield.estimate.carve_kernels import Window, count_votes, find_behind, packed
 from refield.estimate.detect import Changed, Mask
-from refield.estimate.lattice import EVERY_WAY, Lattice, Voxels
+from refield.estimate.lattice import Lattice, Voxels
 from refield.estimate.look import Array, View
+from refield.scene.planes import Plane
 from refield.vision import pixels
+
+_RESOLVED = 2.0  # pixels; what is nearer to each other is one
+_ROOM = 0.3  # of a place's largest side, around it: as much as around the box in which an old object is outlined
 
 
 @dataclass(frozen=True)
 class HullConfig:
     """How the change hull is carved."""
 
-    longest: int = 96
-    """voxels along the longest side"""
+    longest: int = 128
+    """voxels along the longest side of each place"""
     ray_steps: int = 64
     """samples along each changed pixel's ray when looking for where the hull is"""
     margin: int = 1
     """pixels the change masks are grown by before carving"""
     surface: float = 1.5
     """pixels; a point this close to the old surface is on it"""
-    convincing: float = 0.06
-    """clusters for which less than this part of the strongest's difference speaks are left out"""
     smallest: int = 40
     """voxels; smaller parts are dropped"""
 
 
 @dataclass(frozen=True)
 class Hull:
-    """The carved change."""
+    """The carved change around one place."""
 
     lattice: Lattice
     hull: Voxels
@@ -50,6 +54,8 @@ class Hull:
     """no old view looks through it"""
     unchanged: Voxels
     """some new view shows it as it was"""
+    free: Voxels
+    """in front of what holds things up"""
     behind: Array
     """how far behind the old surface it is, in the view that comes nearest to it; world units"""
 
@@ -88,71 +94,102 @@ def _windows(views: Sequence[View], config: HullConfig) -> tuple[Array, Array, A
     return lenses, depths, np.array([config.surface * v.pixel_angle for v in views], np.float64)
 
 
-def find_region(changed: Sequence[Changed], config: HullConfig) -> Lattice | None:
-    """The lattice that holds everything that may be in the hull; None if no point can be."""
+def find_regions(changed: Sequence[Changed], config: HullConfig, least: float) -> list[Lattice]:
+    """Lattices around what may be in the hull, apart from each other; none where fewer than the part ``least`` of every
+    photo's pixels speak for it.
+
+    Each place has its own, or a small thing would have no voxels beside a large one, or beside a poor field's errors
+    that meet far away.
+    """
     seen = [(c.witness(), pixels.dilate(c.mask, config.margin)) for c in changed]
     needed = min(2, len(changed))
-    kept = []
+    kept, steps = [np.zeros((0, 3), np.float32)], [0.0]
     for c in changed:
-        points = _points_before_surface(c, config)
-        if len(points) == 0:
-            continue
-        inside, against = votes(points, seen, config)
-        kept.append(points[(inside >= needed) & (against == 0)])
-    points = np.concatenate(kept) if kept else np.zeros((0, 3), np.float32)
-    if len(points) < 20:
-        return None
-    points = _convincing(points, changed, config)
-    low, high = np.quantile(points, 0.002, axis=0), np.quantile(points, 0.998, axis=0)
-    pad = 0.06 * float((high - low).max())
-    return Lattice.over((low - pad).astype(np.float32), (high + pad).astype(np.float32), config.longest)
+        points, step = _points_before_surface(c, config)
+        if len(points):
+            inside, against = votes(points, seen, config)
+            kept.append(points[(inside >= needed) & (against == 0)])
+            steps.append(step)
+    places = [p for p in _clusters(np.concatenate(kept), max(steps)) if _share(p, changed) >= least]
+    boxes = [np.quantile(p, [0.002, 0.998], axis=0) for p in places]
+    return [_lattice_over(box, changed, config) for box in _apart([_padded(box) for box in boxes])]
 
 
-def _convincing(points: Array, changed: Sequence[Changed], config: HullConfig) -> Array:
-    """The points without clusters that hardly any difference speaks for: a poor field's errors meet far away."""
-    lattice = Lattice.over(points.min(0), points.max(0), 48)
-    ijk, _ = lattice.index(points)
-    filled = np.zeros(lattice.shape, bool)
-    filled[tuple(ijk.T)] = True
-    labels, count = ndimage.label(filled, EVERY_WAY)
-    owner = labels[tuple(ijk.T)]
-    mass = np.array([_mass(points[owner == k], changed) for k in range(1, count + 1)])
-    keep = np.concatenate([[False], mass > config.convincing * mass.max()])
-    return points[keep[owner]]
+def _clusters(points: Array, step: float) -> list[Array]:
+    """Points (N, 3) in parts between which there is more than a ``step``."""
+    cells, cell_of = np.unique(np.floor(points / max(step, 1e-9)).astype(np.int64), axis=0, return_inverse=True)
+    pairs = cKDTree(cells).query_pairs(1.0, p=np.inf, output_type="ndarray")
+    beside = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
+    count, label = connected_components(beside, directed=False)
+    return [points[label[cell_of.ravel()] == k] for k in range(count)]
 
 
-def _mass(points: Array, changed: Sequence[Changed]) -> float:
-    """Colour difference under a cluster, summed over pixels and views, less if some views that look there see none."""
-    mass, agree, asked = 0.0, 0.0, 0.0
+def _share(points: Array, changed: Sequence[Changed]) -> float:
+    """Part of a photo's pixels that changed where points (N, 3) are, in the photo in which it is largest."""
+    shares = [0.0]
     for c in changed:
         uv, _, inside = c.view.project(points)
         on = np.zeros(c.view.shape, bool)
         ij = uv[inside].astype(np.int64)
         on[ij[:, 1], ij[:, 0]] = True
-        mass += float(c.difference[on & c.mask].sum()) / (c.view.camera.width * c.view.camera.height)
-        agree += float(c.view.lookup(c.mask, uv, inside)[inside].sum())
-        asked += float(inside.sum())
-    return mass * (agree / max(asked, 1.0)) ** 2
+        shares.append(float((pixels.close(on, 5) & c.mask).mean()))
+    return max(shares)
 
 
-def _points_before_surface(c: Changed, config: HullConfig, at_most: int = 2500) -> Array:
+def _padded(box: Array) -> Array:
+    """A box (2, 3) with room around it for what is asked of an object's surroundings."""
+    pad = _ROOM * (box[1] - box[0]).max()
+    return np.stack([box[0] - pad, box[1] + pad])
+
+
+def _apart(boxes: list[Array]) -> list[Array]:
+    """Boxes (2, 3), those that overlap put together until none do."""
+    out: list[Array] = []
+    for box in boxes:
+        while True:
+            meets = [o for o in out if (np.maximum(box[0], o[0]) < np.minimum(box[1], o[1])).all()]
+            if not meets:
+                break
+            out = [o for o in out if not any(o is m for m in meets)]
+            box = np.stack([np.min([o[0] for o in (box, *meets)], 0), np.max([o[1] for o in (box, *meets)], 0)])
+        out.append(box)
+    return out
+
+
+def _lattice_over(box: Array, changed: Sequence[Changed], config: HullConfig) -> Lattice:
+    """A lattice over a box (2, 3), no finer than photos resolve what is in it."""
+    pixel = min(float(np.linalg.norm(box.mean(0) - c.view.centre)) * c.view.pixel_angle for c in changed)
+    return Lattice.over(box[0].astype(np.float32), box[1].astype(np.float32), config.longest, _RESOLVED * pixel)
+
+
+def _points_before_surface(c: Changed, config: HullConfig, at_most: int = 2500) -> tuple[Array, float]:
+    """Points (N, 3) along the rays of changed pixels, and how far they are from each other on most of them."""
     ys, xs = np.nonzero(c.mask)
     if len(ys) == 0:
-        return np.zeros((0, 3), np.float32)
+        return np.zeros((0, 3), np.float32), 0.0
     pick = np.linspace(0, len(ys) - 1, min(at_most, len(ys))).astype(int)
     d, depth = c.view.directions[ys[pick], xs[pick]], c.view.depth[ys[pick], xs[pick]]
     finite = c.view.depth[np.isfinite(c.view.depth)]
     far = float(np.quantile(finite, 0.95)) if len(finite) else 1.0
     reach = np.minimum(depth, far) * 1.05
     t = np.linspace(0.1, 1.0, config.ray_steps, dtype=np.float32)
-    return (c.view.centre + d[:, None] * (reach[:, None] * t)[..., None]).reshape(-1, 3).astype(np.float32)
+    points = c.view.centre + d[:, None] * (reach[:, None] * t)[..., None]
+    return points.reshape(-1, 3).astype(np.float32), float(np.median(reach) * (t[1] - t[0]))
 
 
-def carve(lattice: Lattice, seen: Sequence[tuple[View, Mask]], old: Sequence[View], config: HullConfig) -> Hull:
-    """The hull on a lattice, from the new views' masks and the old renderings."""
+def carve(
+    lattice: Lattice,
+    seen: Sequence[tuple[View, Mask]],
+    old: Sequence[View],
+    planes: Sequence[Plane],
+    config: HullConfig,
+) -> Hull:
+    """The hull on a lattice, from the new views' masks, the old renderings, and what holds things up."""
     points = lattice.centres.reshape(-1, 3)
     inside, against = votes(points, [(v, pixels.dilate(m, config.margin)) for v, m in seen], config)
     hull = (inside >= min(2, len(seen))) & (against == 0)
     through, behind = look_behind(points, old, config)
-    found = (hull, ~through, against > 0, behind)
-    return Hull(lattice, *(a.reshape(lattice.shape) for a in found))
+    free = np.ones(len(points), bool)
+    for plane in planes:
+        free &= plane.above(points) > max(0.5 * lattice.cell, plane.noise)
+    return Hull(lattice, *(a.reshape(lattice.shape) for a in (hull, ~through, against > 0, free, behind)))

@@ -71,10 +71,14 @@ class Body:
     lattice: Lattice
     voxels: Voxels
 
-    @property
+    @cached_property
     def places(self) -> Array:
         """(K, 3) the voxels' centres"""
         return self.lattice.centres[self.voxels]
+
+    @property
+    def volume(self) -> float:
+        return int(self.voxels.sum()) * self.lattice.cell**3
 
 
 def components(voxels: Voxels, smallest: int) -> list[Voxels]:

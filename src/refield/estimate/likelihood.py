@@ -1,8 +1,9 @@
 """What a hypothesis of what changed leaves unexplained in the new photos: one number, to compare hypotheses by.
 
 Each pixel is asked how far its photo is from the picture that the hypothesis makes, beside what counts as a change
-there. Beyond that it only says that something is wrong, and costs 1. What may show anything, since something came or
-nobody knows what is behind, costs less than what is wrong, and more than what is right.
+there; beyond that its cost grows as the field's own errors become seldom. What may show anything, since something came
+or nobody knows what is behind, costs less than what is wrong, and more than what is right. Each body costs as much in
+every photo that shows it, at each place where it is told.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from refield.estimate.arrive import CAME, least_gain, shadows_of
-from refield.estimate.detect import difference
+from refield.estimate.arrive import shadows_of
+from refield.estimate.cost import CAME, UNKNOWN, price, wrongness
+from refield.estimate.detect import Mask, difference
 from refield.estimate.explain import LIMIT, Compared, relit
 from refield.estimate.ground import Ground
 from refield.estimate.lattice import Body
@@ -23,12 +24,6 @@ from refield.estimate.objects import Old
 from refield.estimate.past import Past, silhouette
 from refield.estimate.pose_change import SIDE, PoseChange
 from refield.scene.pose import invert, transform
-
-_BODY = 3.0
-"""times the fewest pixels that a thing must fill in a photo: what one that left costs, for all photos, and again as
-much where it went"""
-_UNKNOWN = 0.4
-"""what a pixel costs that may show anything, since nobody had seen what is behind"""
 
 
 @dataclass(frozen=True)
@@ -66,41 +61,44 @@ def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     A newcomer is asked for where a photo shows it and what it stands before is known.
     """
     found = [_left(ground, settled, p) for p in settled.views]
-    left, tells = [e for e, _ in found], [t for _, t in found]
-    pixels, smallest = sum(e.size for e in left), ground.believe.smallest
-    arrived, came, least = [], [], least_gain(ground, settled.views)
+    left, tells = [e for e, _, _ in found], [t for _, t, _ in found]
+    arrived, came, cost, smallest = [], [], 0.0, ground.believe.smallest
     for one in settled.arrived:
         shown = shadows_of(settled.views, one)
         gain = sum(float((e[here & t] - CAME).sum()) for here, t, e in zip(shown, tells, left))
+        least = price(shown, smallest)
         if gain > least:
+            cost += least
             arrived.append(one)
             came.append(gain / sum(int(here.sum()) for here in shown))
             left = [np.where(here, CAME, e) for here, e in zip(shown, left)]
-    body = _BODY * smallest * pixels / max(len(left), 1)
-    bodies = (2 * len(settled.moved) + len(settled.removed)) * body + len(arrived) * least
+    for k in (*settled.moved, *settled.removed):
+        cost += price((silhouette(p.view, settled.olds[k]) for p in settled.views), smallest)
+    cost += sum(price(shown, smallest, moved=True) for shown in zip(*(placed for _, _, placed in found)))
     told = replace(settled, arrived=tuple(arrived), came=tuple(came))
-    return told, bodies + sum(float(e.sum()) for e in left)
+    return told, cost + sum(float(e.sum()) for e in left)
 
 
-def _left(ground: Ground, settled: Settled, p: Past) -> tuple[Array, NDArray[np.bool_]]:
-    """(H, W) in [0, 1], what is left unexplained of each pixel of a photo, but for what arrived; and the pixels
-    of which it is known what they show without that."""
+def _left(ground: Ground, settled: Settled, p: Past) -> tuple[Array, Mask, list[Mask]]:
+    """(H, W) what is left unexplained of each pixel of a photo, but for what arrived; the pixels of which it is known
+    what they show without that; and those that show each of the objects that moved."""
     picture, anything = p.rgb, p.was & ~p.known
-    depth, moved = p.beyond, np.zeros(p.view.shape, bool)
+    depth, moved, placed = p.beyond, np.zeros(p.view.shape, bool), []
     for k, change in settled.moved.items():
         picture, depth, shown, bare = _before(ground, settled.olds[k], change, p, picture, depth)
         anything, moved = (anything & ~shown) | bare, moved | shown
+        placed.append(shown)
     apart = difference(p.view, picture, ground.detect)
-    wrong = LIMIT * p.changed.threshold * np.where(moved, LIMIT, 1)  # never seen in this light, nor by these cameras
-    left = np.minimum((apart / wrong) ** 2, 1)
+    # never seen in this light, nor by these cameras
+    left = wrongness(apart, p.changed.threshold * np.where(moved, LIMIT, 1))
     told = ~p.changed.new & ~(p.changed.light & ~p.was)
-    left = np.where(anything, _UNKNOWN, np.where(told, left, 0)).astype(np.float32)
-    return left, told & ~anything
+    left = np.where(anything, UNKNOWN, np.where(told, left, 0)).astype(np.float32)
+    return left, told & ~anything, placed
 
 
 def _before(
     ground: Ground, old: Old, change: PoseChange, p: Past, picture: Array, depth: Array
-) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[Array, Array, Mask, Mask]:
     """The picture (H, W, 3) and its depth with a moved object in it, in the light in which the photo shows it; the
     pixels that show it, and those of them that show what no old photo saw of it."""
     view, pose = p.view, change.new_from_old

@@ -173,6 +173,19 @@ def seen_as(
     return Old(lattice, voxels, free, cloud, tuple(patches)) if len(cloud.points) >= FEWEST_POINTS else None
 
 
+def as_one(
+    field: Field, frames: Sequence[Frame], pieces: Sequence[Old], planes: Sequence[Plane], config: ObjectConfig
+) -> Old | None:
+    """Pieces of a thing put together; None if old photos (``frames``) show too little of it."""
+    at = np.concatenate([piece.lattice.centres[piece.voxels] for piece in pieces])
+    middle, half = (at.min(0) + at.max(0)) / 2, config.box * (at.max(0) - at.min(0)) / 2
+    low, high = middle - half, middle + half
+    patches = look_around(field, frames, corners_of(low, high), config.rays)
+    lattice = Lattice.over(low, high, config.longest)
+    voxels = np.logical_or.reduce([piece.lattice.holds(piece.voxels, lattice.centres) for piece in pieces])
+    return seen_as(lattice, voxels, free_voxels(lattice, planes), patches, planes, config) if patches else None
+
+
 def _between(lattice: Lattice, voxels: Voxels, seen: Array, planes: Sequence[Plane]) -> Voxels:
     """Those of an object's voxels in the convex hull of what is seen of it (N, 3) and of what is beneath that, down to
     what it stands on: where cameras look from some sides only, all that is behind it might be of it as well."""

@@ -8,7 +8,7 @@ newcomers is carved by newcomers only.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -44,6 +44,8 @@ class Past:
     """pixels at which an object that was placed stands in front"""
     beyond: Array
     """as ``depth``, without the objects that were placed since"""
+    telling: Mask
+    """pixels that would show that what was taken out is gone: they look otherwise without it, as far as anyone knows"""
 
     @property
     def view(self) -> View:
@@ -95,8 +97,9 @@ def _look_past(
     gone = pixels.close(gone, 3)
     guess = was & ((memory.times_seen(view, depth, was) == 0) | _beneath(view, depth, olds, was))
     known = ~pixels.dilate(pixels.close(guess, 3), 1)
+    telling = ~known | (difference(replace(view, photo=view.rgb), rgb, config) > c.threshold)
     diff = difference(view, rgb, config)
-    return Past(c, rgb, depth, gone, known, diff, np.zeros(view.shape, bool), depth)
+    return Past(c, rgb, depth, gone, known, diff, np.zeros(view.shape, bool), depth, telling)
 
 
 def _beneath(view: View, depth: Array, olds: Sequence[Old], where: Mask) -> Mask:
@@ -121,22 +124,27 @@ def silhouette(view: View, old: Old) -> Mask:
 def gone_score(past: Sequence[Past], old: Old) -> tuple[float, int]:
     """How much better the photos agree with what is behind than with the object: (part of known pixels, pixels).
 
-    Only pixels are asked that show the object in the old field, whose background is known, and before which no object
-    that was placed stands.
+    Only pixels are asked that show the object in the old field, whose background is known and looks otherwise, and
+    before which no object that was placed stands.
     """
     better, asked = 0, 0
     for p in past:
-        here = silhouette(p.view, old) & p.was & p.known & ~p.covered
+        here = silhouette(p.view, old) & p.was & p.known & p.telling & ~p.covered
         asked += int(here.sum())
         better += int((here & (p.difference < 0.7 * p.changed.difference) & p.changed.mask).sum())
     return (better / asked if asked else 0.0), asked
 
 
-def changed_share(changed: Sequence[Changed], old: Old) -> float:
-    """Part of the pixels that show the object in the old field which changed, over all new views; 0 if too few do."""
+def changed_share(past: Sequence[Past], old: Old) -> float:
+    """Part of the pixels that show the object in the old field, and would show that it is gone, which changed, over all
+    new views; 0 if too few do.
+
+    Args:
+        past: the photos past this object alone.
+    """
     shown, touched = 0, 0
-    for c in changed:
-        here = silhouette(c.view, old)
+    for p in past:
+        here = silhouette(p.view, old) & p.telling
         shown += int(here.sum())
-        touched += int((here & c.certain).sum())
+        touched += int((here & p.changed.certain).sum())
     return touched / shown if touched >= 12 else 0.0

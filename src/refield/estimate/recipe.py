@@ -13,10 +13,10 @@ from refield.estimate import detect, hull, light, look
 from refield.estimate.associate import is_crumb
 from refield.estimate.conclude import Told, concluded, disagreeing
 from refield.estimate.detect import Changed, DetectConfig, Errors, Mask
-from refield.estimate.faces import Parts, changed_parts
+from refield.estimate.faces import Part, Parts, changed_parts
 from refield.estimate.ground import AssociateConfig, Ground
 from refield.estimate.hull import Hull, HullConfig
-from refield.estimate.lattice import Lattice, Voxels, grown
+from refield.estimate.lattice import grown
 from refield.estimate.light import SAME_PLACE
 from refield.estimate.likelihood import Settled
 from refield.estimate.look import Array, View
@@ -136,18 +136,17 @@ def estimate_change(
         why = "no pixel differs by more than the field's own errors on the old photos"
         return SceneChange((), photos, why + beside)
     say("hull")
-    region = hull.find_region(scene.changed, config.hull)
-    if region is None:
+    hulls = _carved(scene)
+    if not hulls:
         answer = disagreeing(scene.changed, photos, scene.errors)
         return replace(answer, why=answer.why + beside)
-    carved, free = _carved(scene, region)
-    parts = changed_parts(scene.changed, carved, free, config.hull, models.segmenter)
-    olds = _were_there(scene, carved, parts.things or parts.others, parts.where)
+    parts = changed_parts(scene.changed, hulls, config.hull, models.segmenter)
+    olds = _were_there(scene, parts.things or parts.others)
     say("pose")
     up = scene.planes[0].normal if scene.planes else _up(capture)
     photographed = [f for f in capture.frames if f.made is None]
     ground = Ground(
-        field, carved, free, up, scene.planes, scene.survey, scene.errors.memory, photographed,
+        field, hulls, up, scene.planes, scene.survey, scene.errors.memory, photographed,
         config.detect, config.hull, config.objects, config.associate, config.register, config.refine, models.matcher,
     )  # fmt: skip
     search = Search(ground, scene.changed)
@@ -272,28 +271,20 @@ def _still(points: Array, changed: Sequence[Changed]) -> Mask:
     return shown & ~touched
 
 
-def _carved(scene: _Scene, region: Lattice) -> tuple[Hull, Voxels]:
-    """The change hull, and the voxels in front of what holds things up."""
-    config = scene.config.hull
+def _carved(scene: _Scene) -> list[Hull]:
+    """The change hull, place by place."""
+    config, seen = scene.config.hull, [(c.witness(), c.mask) for c in scene.changed]
     old = [*scene.survey, *(c.view for c in scene.changed)]
-    carved = hull.carve(region, [(c.witness(), c.mask) for c in scene.changed], old, config)
-    free = np.ones(region.shape, bool)
-    for plane in scene.planes:
-        free &= plane.above(region.centres) > max(0.5 * region.cell, plane.noise)
-    return carved, free
+    places = hull.find_regions(scene.changed, config, scene.config.associate.smallest)
+    return [hull.carve(place, seen, old, scene.planes, config) for place in places]
 
 
-def _were_there(
-    scene: _Scene, carved: Hull, parts: Sequence[Voxels], where: Voxels, known: Sequence[Old] = ()
-) -> list[Old]:
-    """Whole objects of the old field that parts of the change hull belong to, but for those already known.
-
-    ``where``: as `Parts` has it.
-    """
+def _were_there(scene: _Scene, parts: Sequence[Part], known: Sequence[Old] = ()) -> list[Old]:
+    """Whole objects of the old field that parts of the change hull belong to, but for those already known."""
     found: list[Old] = []
     config = scene.config
     for part in parts[: config.associate.most]:
-        at = carved.lattice.centres[part]
+        at, carved = part.body.places, part.carved
         if any(old.lattice.holds(grown(old.voxels, old.margin), at).mean() > 0.5 for old in (*known, *found)):
             continue
         again = next((k for k in scene.known if k.grid.contains(torch.from_numpy(at)).float().mean() > 0.5), None)
@@ -302,7 +293,7 @@ def _were_there(
             if old is not None:
                 found.append(old)
                 continue
-        seeds = Seeds(carved.lattice, part, carved.hull, carved.unchanged, where)
+        seeds = Seeds(carved.lattice, part.voxels, carved.hull, carved.unchanged, part.where)
         old = outline(scene.field, scene.capture.train, seeds, scene.planes, scene.models.segmenter, config.objects)
         if old is not None:
             found.append(old)
@@ -315,13 +306,13 @@ def _overlooked(scene: _Scene, ground: Ground, settled: Settled, parts: Parts, k
     What they would explain is explained by nothing else, or the photos show what was behind them. Crumbs are none,
     unless an earlier visit knows them.
     """
-    least = 0.15 * max(float(p.sum()) for p in (*parts.things, *parts.others))
+    least = 0.15 * max(p.body.volume for p in (*parts.things, *parts.others))
     more: list[Old] = []
     for part in parts.others:
-        needed = unexplained(ground, settled, part)
-        if needed or part.sum() >= least:
-            found = _were_there(scene, ground.hull, [part], part, [*known, *more])
-            found = [o for o in found if o.remembered or not is_crumb(scene.changed, o, ground.believe.smallest)]
+        needed = unexplained(ground, settled, part.body)
+        if needed or part.body.volume >= least:
+            found = _were_there(scene, [replace(part, where=part.voxels)], [*known, *more])
+            found = [o for o in found if o.remembered or not is_crumb(ground, scene.changed, o)]
             more += [old for old in found if needed or looks_gone(ground, scene.changed, old)]
     return more
 

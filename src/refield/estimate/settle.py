@@ -35,12 +35,12 @@ from refield.estimate.fit import (
 )
 from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
-from refield.estimate.lattice import Body, Voxels
+from refield.estimate.lattice import Body
 from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
-from refield.estimate.outline import standing
+from refield.estimate.outline import as_one, standing
 from refield.estimate.past import Past, changed_share
 from refield.estimate.pose_change import FINER, PoseChange, refine
 from refield.estimate.rotations import best_rotations, may_be_turned
@@ -64,7 +64,7 @@ class Search:
     fits: dict[int, list[Fit]] = field(default_factory=lambda: defaultdict(list))
     """where each was found at any time"""
     wholes: Kept[Old | None] = field(default_factory=Kept)
-    """the thing that an outline is a piece of"""
+    """the thing that an outline is a piece of, or two of them are"""
     slides: Kept[Fit | None] = field(default_factory=Kept)
     """how an object may have slid"""
     again: Kept[list[Fit]] = field(default_factory=Kept)
@@ -150,6 +150,7 @@ class Search:
             *((("again", k, 0), partial(self._again, k=k)) for k in best.removed if best.arrived),
             *((("stayed", k, 0), partial(self._stayed, k=k)) for k in changed),
             *((("outlined", k, 0), partial(self._outlines, k=k)) for k in changed),
+            *((("joined", k, 0), partial(self._joined, k=k)) for k in best.moved if len(best.moved) > 1),
             *((("slid", k, id(one)), partial(self._slides, k=k, one=one)) for k, one in self._asked(best)),
         ]
 
@@ -221,6 +222,22 @@ class Search:
         gone, views = self._without(best, k, old)
         others = [o for o in gone if o is not old and not old.within(o)]
         return with_comoving(self.ground, old, views, None if change is None else change.new_from_old, others)
+
+    def _joined(self, best: Settled, k: int) -> Iterator[Settled]:
+        """With an object and another that went where its motion takes it as one thing."""
+        old, change = best.olds[k], best.moved[k]
+        for j, other in best.moved.items():
+            if j == k or not at_one_place(change, other, best.olds[j]):
+                continue
+            moved = {i: c for i, c in best.moved.items() if i != j}
+            alone = replace(best, moved=moved, touched=tuple(i for i in best.touched if i != j))
+            g = self.ground
+            both = self.wholes.get(
+                (old, best.olds[j]), partial(as_one, g.field, g.photographed, (old, best.olds[j]), g.planes, g.shape)
+            )
+            found = None if both is None else self._refined(alone, k, both, change)
+            if both is not None and found is not None:
+                yield self._with(alone, k, both, found)
 
     def _refined(self, best: Settled, k: int, old: Old, change: PoseChange) -> PoseChange | None:
         """An object's pose in the photos of a hypothesis; None if they do not show it there."""
@@ -365,9 +382,8 @@ def _completed(
     return Settled(moved, removed, tuple(arrived), tuple(views), tuple(olds), tuple(touched))
 
 
-def unexplained(ground: Ground, settled: Settled, part: Voxels) -> bool:
+def unexplained(ground: Ground, settled: Settled, asked: Body) -> bool:
     """Whether most of the changed pixels that some voxels project to are not accounted for by what was settled."""
-    asked = Body(ground.hull.lattice, part)
     shown, left = 0, 0
     for p in settled.views:
         here = shadow_of(p.view, asked)
@@ -379,9 +395,8 @@ def unexplained(ground: Ground, settled: Settled, part: Voxels) -> bool:
 
 def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
     """Whether an object's pixels changed and show what was behind it."""
-    if changed_share(changed, old) < ground.believe.touched:
-        return False
-    return left_by(ground, without(ground, changed, [old]), old) is not None
+    past = without(ground, changed, [old])
+    return changed_share(past, old) >= ground.believe.touched and left_by(ground, past, old) is not None
 
 
 def is_piece(old: Old, others: Sequence[Old]) -> bool:

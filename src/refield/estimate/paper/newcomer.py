@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from refield.estimate.detect import Changed
-from refield.estimate.hull import HullConfig, carve, find_region
-from refield.estimate.lattice import components
+from refield.estimate.hull import HullConfig, carve, find_regions
+from refield.estimate.lattice import Body, components
 from refield.estimate.look import View
 from refield.estimate.paper.associate import Thing
 from refield.scene.change import OccupancyGrid
@@ -27,10 +27,10 @@ def newcomer_grid(came: Thing, old: Sequence[View], config: HullConfig) -> Occup
         Changed(s.pair.view, s.pair.unlike, np.zeros_like(s.pair.unlike), s.mask, *np.zeros((2, *s.mask.shape), bool))
         for s in came.sightings
     ]
-    region = find_region(changed, config)
-    if region is None:
-        return None
-    views = [*old, *(c.view for c in changed)]
-    carved = carve(region, [(c.view, c.mask) for c in changed], views, config)
-    parts = components(carved.hull & ~carved.solid, config.smallest)
-    return region.grid(parts[0].astype(np.float32)) if parts else None
+    views, seen = [*old, *(c.view for c in changed)], [(c.view, c.mask) for c in changed]
+    parts = []
+    for region in find_regions(changed, config, 0.0):
+        carved = carve(region, seen, views, (), config)
+        parts += [Body(region, voxels) for voxels in components(carved.hull & ~carved.solid, config.smallest)]
+    body = max(parts, key=lambda b: b.volume, default=None)
+    return None if body is None else body.lattice.grid(body.voxels.astype(np.float32))
