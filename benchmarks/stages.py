@@ -62,7 +62,7 @@ class Stages:
     change: SceneChange
     changed: Sequence[Changed]
     carved: list[Hull]
-    """and the voxels in front of what holds things up"""
+    """place by place"""
     candidates: Sequence[Candidate]
     refined: PoseChange
 

@@ -32,6 +32,14 @@ def test_photos_of_different_states_are_not_understood():
     assert change.unexplained and "one and the same state" in change.why
 
 
+def test_places_that_are_too_small_for_a_thing_are_not_said_to_be_none():
+    changed = [photo(f"{k}.jpg", 0.002) for k in range(2)]
+    assert disagreeing(changed, (), ERRORS, 0.003).why.endswith(
+        "more than one photo shows, and that fills 0.3 % of any"
+    )
+    assert disagreeing(changed, (), ERRORS).why.endswith("more than one photo shows")
+
+
 def test_one_photo_of_several_that_differs_alone_is_named_and_tells_of_no_change():
     change = told(0.0, 0.0, 0.002, 0.034)
     assert not change.unexplained

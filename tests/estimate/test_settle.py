@@ -11,7 +11,7 @@ from refield.estimate import fit, recipe, rotations, settle
 from refield.estimate.lattice import Body, Lattice, grown, some_of
 from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of
-from refield.estimate.outline import restricted
+from refield.estimate.outline import as_one, restricted
 from refield.scene.pose import angle_between, transform
 from refield.scene.srgb import to_linear, to_srgb
 from refield.vision import pixels
@@ -129,6 +129,8 @@ def test_two_that_went_the_same_way_are_one(capture, tmp_path, monkeypatch):
     ((_, whole),) = [(j, joined.olds[j]) for j in joined.moved]
     assert all(half.within(whole) for half in halves)
     assert judged(ground, joined)[1] < judged(ground, apart)[1]
+    away = replace(halves[1], lattice=replace(old.lattice, low=old.lattice.low + 2))  # they do not touch
+    assert as_one(BEFORE, ground.photographed, (halves[0], away), ground.planes, ground.shape) is None
     elsewhere = replace(change, new_from_old=AWAY @ change.new_from_old)
     assert list(search._joined(replace(apart, moved={0: change, 1: elsewhere}), 0)) == []
 
@@ -186,7 +188,7 @@ def test_what_was_missed_at_first_is_found_among_what_arrived(capture, tmp_path,
 
 
 def test_a_small_thing_among_much_that_changed_is_carved_finely(capture, tmp_path):
-    """On a lattice that holds everything that differs it has too few voxels to be told from a speck."""
+    """On a lattice that holds all that is beside it as well it has too few voxels to be told from a speck."""
     tin = standing((0.09, 0.08, 0.1), 0.5, 0.45, 10, paint=8)
     frames = new_photos(BoxWorld((CRATE.moved(AWAY), tin)), tmp_path)
     coarse = replace(CONFIG, hull=replace(CONFIG.hull, longest=32))

@@ -21,6 +21,19 @@ def test_a_shift_of_a_pixel_is_forgiven_and_a_change_is_not():
         assert found[21:25, 21:25].all() and not found[:15].any()
 
 
+@pytest.mark.parametrize("reach", [0, 1, 2])
+def test_the_difference_is_that_to_the_most_similar_pixel_near_by(reach):
+    a, b = np.random.default_rng(0).random((2, 7, 9, 3)).astype(np.float32)
+    lab = [pixels.to_lab(image) for image in (a, b)]
+    padded = [np.pad(image, ((reach, reach), (reach, reach), (0, 0)), "edge") for image in lab]
+    expected = np.zeros((7, 9))
+    for i, j in np.ndindex(7, 9):
+        windows = [p[i : i + 2 * reach + 1, j : j + 2 * reach + 1] for p in padded]
+        one, two = (np.linalg.norm(lab[k][i, j] - windows[1 - k], axis=-1).min() for k in (0, 1))
+        expected[i, j] = max(one, two)
+    np.testing.assert_allclose(pixels.colour_difference(a, b, reach), expected, rtol=1e-5)
+
+
 def test_exposure_is_fitted_though_a_third_of_the_pixels_changed():
     image = np.clip(pattern(64) * 0.7 + 0.1, 0.05, 0.8)
     gain, offset = np.array([1.2, 0.9, 1.05]), np.array([0.01, 0.0, -0.01])

@@ -43,7 +43,7 @@ def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list[
 def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list[Body]:
     """Bodies that explain changed pixels which nothing else does, those that explain most of them first.
 
-    Each is carved on a lattice of its own: on the hull's, which holds everything, a small thing has few voxels.
+    Each is carved on a lattice of its own: on the hull's, which holds what is beside it, a small thing has few voxels.
     """
     out, open_ = list[Body](), [p.open & p.changed.certain for p in past]
     some = arrivals(ground, past, olds)
@@ -122,11 +122,11 @@ def remarkable(
 
 
 def _may_pay(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
-    """Whether a would-be newcomer may explain what it costs, if all that it does not hide is right."""
-    shadows, gain = shadows_of(past, part), 0.0
+    """Whether a would-be newcomer explains what it costs, beside what was placed already."""
+    shadows, gain = shadows_of(past, exactly(ground, part, past)), 0.0
     for here, p in zip(shadows, past):
-        wrong = wrongness(p.difference, p.changed.threshold)
-        gain += float((wrong - CAME)[here & p.known & ~p.changed.new].sum())
+        told = p.known & ~p.covered & ~p.changed.new & ~(p.changed.light & ~p.was)
+        gain += float((wrongness(p.difference, p.changed.threshold) - CAME)[here & told].sum())
     return gain > price(shadows, ground.believe.smallest)
 
 
@@ -182,7 +182,9 @@ def _only_light(
     things = colours_of_others(part, [(p.view, h) for p, h in zip(past, here)])
     both = [a & np.isfinite(thing[..., 0]) for a, thing in zip(asked, things)]
     shown = [_shows(ground, p, np.where(b[..., None], thing, p.view.photo)) for p, thing, b in zip(past, things, both)]
-    return _count(both, alike) > _count(both, shown) - price(shadows, ground.believe.smallest)
+    # a pixel that a newcomer explains gains no less than this
+    fewest = (1 - CAME) * price(shadows, ground.believe.smallest)
+    return _count(both, alike) > _count(both, shown) - fewest
 
 
 def _count(some: Sequence[Mask], others: Sequence[Mask]) -> int:

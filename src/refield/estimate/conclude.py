@@ -75,10 +75,14 @@ def concluded(scene: Told, settled: Settled) -> SceneChange:
     return SceneChange(tuple(changes), scene.photos, "; ".join(reasons), ins, outs, unexplained)
 
 
-def disagreeing(changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...], errors: Errors) -> SceneChange:
-    """The answer where the photos' changes meet nowhere in space; told if they are more than the odd spot, and more
-    than the field's ``errors`` are in photos that show no change."""
+def disagreeing(
+    changed: Sequence[Changed], photos: tuple[PlacedPhoto, ...], errors: Errors, least: float = 0.0
+) -> SceneChange:
+    """The answer where the photos' changes meet nowhere in space, or only where they fill less than the part ``least``
+    of every photo; told if they are more than the odd spot, and more than the field's ``errors`` are in photos that
+    show no change."""
     why = "the pixels that differ agree on no place that more than one photo shows"
+    why += f", and that fills {100 * least:.2g} % of any" if least else ""
     shares = [float(c.certain.mean()) for c in changed]
     most = int(np.argmax(shares))
     if shares[most] < _LARGE:

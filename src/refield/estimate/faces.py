@@ -125,6 +125,8 @@ def _faces_in(view: View, mask: Mask, lattice: Lattice, allowed: Voxels) -> list
     for k in range(1, count + 1):
         points = view.surface[label == k]
         ijk, inside = lattice.index(points[np.isfinite(points).all(-1)])
+        if not inside.any():
+            continue
         face = np.zeros(lattice.shape, bool)
         face[tuple(ijk[inside].T)] = True
         out.append(grown(face, reach) & allowed)

@@ -46,7 +46,8 @@ class AssociateConfig:
     arrived: float = 0.5
     """part of a newcomer's pixels that nothing else explains"""
     smallest: float = 0.003
-    """part of a photo that a thing must fill in one at least; a smaller one is an error of the field, or an edge"""
+    """part of a photo that a place must fill in one at least, and what bodies cost goes by; what is smaller is an error
+    of the field, or an edge"""
     # the paper's contour area is 1 %, §10.2.2
     trim: float = 0.03
     """part of an object's voxels that the new photos or the ground deny, from which on it is trimmed"""

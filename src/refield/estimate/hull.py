@@ -32,7 +32,7 @@ class HullConfig:
     """How the change hull is carved."""
 
     longest: int = 128
-    """voxels along the longest side of each place"""
+    """voxels along the longest side of each place, with room around it; of each newcomer"""
     ray_steps: int = 64
     """samples along each changed pixel's ray when looking for where the hull is"""
     margin: int = 1

@@ -3,7 +3,7 @@
 Each pixel is asked how far its photo is from the picture that the hypothesis makes, beside what counts as a change
 there; beyond that its cost grows as the field's own errors become seldom. What may show anything, since something came
 or nobody knows what is behind, costs less than what is wrong, and more than what is right. Each body costs as much in
-every photo that shows it, at each place where it is told.
+every photo that shows it, and less where it went: a pose is six numbers, whatever the shape.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class Settled:
 
 
 def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
-    """The hypothesis without newcomers that explain no more than they cost; and the pixels, over all new photos, that
-    it does not explain, with what its bodies cost.
+    """The hypothesis without newcomers that explain no more than they cost; and what it costs: what it leaves
+    unexplained over all new photos, in pixels that are as wrong as a pose may be, and its bodies.
 
     A newcomer is asked for where a photo shows it and what it stands before is known.
     """

@@ -176,14 +176,17 @@ def seen_as(
 def as_one(
     field: Field, frames: Sequence[Frame], pieces: Sequence[Old], planes: Sequence[Plane], config: ObjectConfig
 ) -> Old | None:
-    """Pieces of a thing put together; None if old photos (``frames``) show too little of it."""
+    """Pieces of a thing put together; None if they do not touch, or old photos (``frames``) show too little of it."""
     at = np.concatenate([piece.lattice.centres[piece.voxels] for piece in pieces])
-    middle, half = (at.min(0) + at.max(0)) / 2, config.box * (at.max(0) - at.min(0)) / 2
+    middle, half = (at.min(0) + at.max(0)) / 2, (at.max(0) - at.min(0)) / 2
+    half = np.maximum(half * config.box, half + 3 * max(piece.lattice.cell for piece in pieces))
     low, high = middle - half, middle + half
     patches = look_around(field, frames, corners_of(low, high), config.rays)
     lattice = Lattice.over(low, high, config.longest)
     voxels = np.logical_or.reduce([piece.lattice.holds(piece.voxels, lattice.centres) for piece in pieces])
-    return seen_as(lattice, voxels, free_voxels(lattice, planes), patches, planes, config) if patches else None
+    if not patches or len(components(grown(voxels, 1), 1)) > 1:
+        return None
+    return seen_as(lattice, voxels, free_voxels(lattice, planes), patches, planes, config)
 
 
 def _between(lattice: Lattice, voxels: Voxels, seen: Array, planes: Sequence[Plane]) -> Voxels:

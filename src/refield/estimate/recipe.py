@@ -138,7 +138,8 @@ def estimate_change(
     say("hull")
     hulls = _carved(scene)
     if not hulls:
-        answer = disagreeing(scene.changed, photos, scene.errors)
+        some = hull.find_regions(scene.changed, config.hull, 0.0)
+        answer = disagreeing(scene.changed, photos, scene.errors, config.associate.smallest if some else 0.0)
         return replace(answer, why=answer.why + beside)
     parts = changed_parts(scene.changed, hulls, config.hull, models.segmenter)
     olds = _were_there(scene, parts.things or parts.others)

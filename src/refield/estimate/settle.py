@@ -227,14 +227,13 @@ class Search:
         """With an object and another that went where its motion takes it as one thing."""
         old, change = best.olds[k], best.moved[k]
         for j, other in best.moved.items():
-            if j == k or not at_one_place(change, other, best.olds[j]):
+            pieces = sorted((old, best.olds[j]), key=id)
+            if j == k or any(o.remembered for o in pieces) or not at_one_place(change, other, best.olds[j]):
                 continue
             moved = {i: c for i, c in best.moved.items() if i != j}
             alone = replace(best, moved=moved, touched=tuple(i for i in best.touched if i != j))
             g = self.ground
-            both = self.wholes.get(
-                (old, best.olds[j]), partial(as_one, g.field, g.photographed, (old, best.olds[j]), g.planes, g.shape)
-            )
+            both = self.wholes.get(tuple(pieces), partial(as_one, g.field, g.photographed, pieces, g.planes, g.shape))
             found = None if both is None else self._refined(alone, k, both, change)
             if both is not None and found is not None:
                 yield self._with(alone, k, both, found)
