@@ -122,8 +122,9 @@ def remarkable(
 
 
 def _may_pay(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
-    """Whether a would-be newcomer explains what it costs, beside what was placed already."""
-    shadows, gain = shadows_of(past, exactly(ground, part, past)), 0.0
+    """Whether a would-be newcomer explains what it costs, beside what was placed already, with the margin by which it
+    was carved: what hardly pays is rather the place of a small thing that left."""
+    shadows, gain = shadows_of(past, part), 0.0
     for here, p in zip(shadows, past):
         told = p.known & ~p.covered & ~p.changed.new & ~(p.changed.light & ~p.was)
         gain += float((wrongness(p.difference, p.changed.threshold) - CAME)[here & told].sum())
