@@ -126,7 +126,7 @@ def _may_pay(ground: Ground, part: Body, past: Sequence[Past]) -> bool:
     was carved: what hardly pays is rather the place of a small thing that left."""
     shadows, gain = shadows_of(past, part), 0.0
     for here, p in zip(shadows, past):
-        told = p.known & ~p.covered & ~p.changed.new & ~(p.changed.light & ~p.was)
+        told = p.known & ~p.covered & p.asked
         gain += float((wrongness(p.difference, p.changed.threshold) - CAME)[here & told].sum())
     return gain > price(shadows, ground.believe.smallest)
 
@@ -183,7 +183,7 @@ def _only_light(
     things = colours_of_others(part, [(p.view, h) for p, h in zip(past, here)])
     both = [a & np.isfinite(thing[..., 0]) for a, thing in zip(asked, things)]
     shown = [_shows(ground, p, np.where(b[..., None], thing, p.view.photo)) for p, thing, b in zip(past, things, both)]
-    # a pixel that a newcomer explains gains no less than this
+    # about a quarter of the smallest thing's pixels in these photos: by fewer the two do not differ
     fewest = (1 - CAME) * price(shadows, ground.believe.smallest)
     return _count(both, alike) > _count(both, shown) - fewest
 

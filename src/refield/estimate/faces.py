@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
@@ -36,7 +37,7 @@ class Part:
     where: Voxels
     """voxels at which, or before which, most views show a thing, and none shows anything else"""
 
-    @property
+    @cached_property
     def body(self) -> Body:
         return Body(self.carved.lattice, self.voxels)
 

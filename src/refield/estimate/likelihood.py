@@ -91,9 +91,8 @@ def _left(ground: Ground, settled: Settled, p: Past) -> tuple[Array, Mask, list[
     apart = difference(p.view, picture, ground.detect)
     # never seen in this light, nor by these cameras
     left = wrongness(apart, p.changed.threshold * np.where(moved, LIMIT, 1))
-    told = ~p.changed.new & ~(p.changed.light & ~p.was)
-    left = np.where(anything, UNKNOWN, np.where(told, left, 0)).astype(np.float32)
-    return left, told & ~anything, placed
+    left = np.where(anything, UNKNOWN, np.where(p.asked, left, 0)).astype(np.float32)
+    return left, p.asked & ~anything, placed
 
 
 def _before(

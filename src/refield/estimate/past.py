@@ -52,6 +52,11 @@ class Past:
         return self.changed.view
 
     @cached_property
+    def asked(self) -> Mask:
+        """Pixels that speak of bodies: not of what no old photo saw, nor of light alone on what stayed."""
+        return ~self.changed.new & ~(self.changed.light & ~self.was)
+
+    @cached_property
     def explained(self) -> Mask:
         """Changed pixels that show what was behind."""
         alike = (self.difference < self.changed.threshold).astype(np.uint8)
