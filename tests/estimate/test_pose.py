@@ -156,6 +156,22 @@ def turning(stage):
     )
 
 
+def test_an_object_is_drawn_by_its_points_about_as_its_field_shows_it(stage):
+    """With its colours, at its distance, nothing of its back; with gaps where its points are sparser than pixels."""
+    sight = Sight(stage.scene.field, stage.old, stage.past, [stage.old])
+    (field, points) = (layers_at(sight, TRUE, 8_000, by_points=drawn) for drawn in (False, True))
+    for looked_up, drawn in zip(field.show(TRUE), points.show(TRUE)):
+        solid, found = (layer.opacity > 0.5 for layer in (looked_up, drawn))
+        both = solid & found
+        assert float(both.sum() / found.sum()) > 0.9 and float(both.sum() / solid.sum()) > 0.6
+        assert float((looked_up.own - drawn.own)[both].abs().mean()) < 0.08
+        away = (looked_up.depth - drawn.depth)[both].abs()
+        assert float(away.median()) < stage.old.lattice.cell and float((away < 0.1).float().mean()) > 0.97
+    poses = [turn(transform(TRUE, CRATE.world_from_box[:3, 3]), degrees, (0, 0, 0)) @ TRUE for degrees in (0, 40, 180)]
+    parts = [[rotations._part(ready, pose) for pose in poses] for ready in (field, points)]
+    assert all(right > 0.8 > max(others) + 0.1 for right, *others in parts)
+
+
 def test_all_rotations_about_a_place_are_asked_what_they_explain(stage):
     """Begun at the right place a hundred degrees off, whence no descent leads back."""
     ground = turning(stage)

@@ -43,14 +43,21 @@ def settled(capture, folder, monkeypatch):
     return change, kept[-1]
 
 
+@pytest.fixture(scope="module")
+def estimated(capture, tmp_path_factory):
+    """What an estimate settles on and from what, made once for all that ask of it."""
+    with pytest.MonkeyPatch.context() as patched:
+        return settled(capture, tmp_path_factory.mktemp("after"), patched)[1]
+
+
 def came_to(ground, olds, changed):
     """The photos without the old objects, and the largest of what arrived in them."""
     views = tuple(settle.without(ground, changed, list(olds)))
     return views, max(settle.newcomers(ground, views, list(olds)), key=lambda body: body.voxels.sum())
 
 
-def test_the_truth_leaves_less_unexplained_than_any_other_hypothesis(capture, tmp_path, monkeypatch):
-    _, (ground, _olds, changed, found) = settled(capture, tmp_path, monkeypatch)
+def test_the_truth_leaves_less_unexplained_than_any_other_hypothesis(estimated):
+    ground, _olds, changed, found = estimated
     ((k, change),) = found.moved.items()
     old = found.olds[k]
 
@@ -83,17 +90,17 @@ def test_the_truth_leaves_less_unexplained_than_any_other_hypothesis(capture, tm
     assert 0.5 * led < left_by(came()) - least < 1.5 * led
 
 
-def test_the_lead_of_an_object_that_no_other_answer_was_tried_for_is_endless(capture, tmp_path, monkeypatch):
-    _, (ground, olds, changed, found) = settled(capture, tmp_path, monkeypatch)
+def test_the_lead_of_an_object_that_no_other_answer_was_tried_for_is_endless(estimated, monkeypatch):
+    ground, olds, changed, found = estimated
     search = settle.Search(ground, changed)
     (k,) = found.moved
     monkeypatch.setattr(settle.Search, "_exchanges", lambda self, best: [])
     assert search.settle(olds).led == {k: math.inf} and 0.13 < found.led[k] < math.inf
 
 
-def test_a_newcomer_that_explains_nothing_is_taken_back(capture, tmp_path, monkeypatch):
+def test_a_newcomer_that_explains_nothing_is_taken_back(estimated):
     """What the photos show as it was is dear to call new; what they show of a newcomer is cheap."""
-    _, (ground, _olds, _changed, found) = settled(capture, tmp_path, monkeypatch)
+    ground, _olds, _changed, found = estimated
     lattice = max((h.lattice for h in ground.hulls), key=lambda one: one.centres.size)
     low, high = lattice.centres.reshape(-1, 3).min(0), lattice.centres.reshape(-1, 3).max(0)
     corner = (lattice.centres < low + 0.15 * (high - low)).all(-1)
@@ -102,9 +109,9 @@ def test_a_newcomer_that_explains_nothing_is_taken_back(capture, tmp_path, monke
     assert kept.arrived == () and left == judged(ground, bare)[1]
 
 
-def test_a_newcomer_that_gains_less_than_the_smallest_thing_would_is_none(capture, tmp_path, monkeypatch):
+def test_a_newcomer_that_gains_less_than_the_smallest_thing_would_is_none(estimated):
     """What is told of is large enough to be seen in each photo; specks of a poor field gain a little as well."""
-    _, (ground, olds, changed, found) = settled(capture, tmp_path, monkeypatch)
+    ground, olds, changed, found = estimated
     views, whole = came_to(ground, olds, changed)
     middle = np.linalg.norm(whole.places - whole.places.mean(0), axis=-1) < 1.5 * whole.lattice.cell
     speck = replace(whole, voxels=some_of(whole.voxels, middle))
@@ -114,9 +121,9 @@ def test_a_newcomer_that_gains_less_than_the_smallest_thing_would_is_none(captur
     assert judged(ground, replace(bare, arrived=(speck,))) == judged(ground, bare)
 
 
-def test_two_that_went_the_same_way_are_one(capture, tmp_path, monkeypatch):
+def test_two_that_went_the_same_way_are_one(estimated):
     """An outline may be cut where nothing is: what moved along is of the thing."""
-    _, (ground, _, changed, found) = settled(capture, tmp_path, monkeypatch)
+    ground, _, changed, found = estimated
     ground = replace(ground, believe=replace(ground.believe, smallest=0.01))  # to be outlined anew costs less
     (k,) = found.moved
     old, change = found.olds[k], found.moved[k]
@@ -135,9 +142,24 @@ def test_two_that_went_the_same_way_are_one(capture, tmp_path, monkeypatch):
     assert list(search._joined(replace(apart, moved={0: change, 1: elsewhere}), 0)) == []
 
 
-def test_what_only_darkens_all_that_is_behind_it_is_no_newcomer(capture, tmp_path, monkeypatch):
+def test_what_was_asked_of_an_object_that_moved_is_not_asked_once_it_has_not(estimated):
+    """Exchanges are listed for one hypothesis, and go on with a better one as soon as there is any."""
+    ground, _, changed, found = estimated
+    search = settle.Search(ground, changed)
+    ((k, change),) = found.moved.items()
+    for one in (found.olds[k], replace(found.olds[k])):
+        search.fits[k].append(fit.Fit(0.0, one, change))
+    exchanges = search._exchanges(replace(found, moved={k: change, k + 1: change}, olds=(*found.olds, found.olds[k])))
+    assert {kind for (kind, j, _), _ in exchanges if j == k} >= {"turned", "joined", "stayed", "outlined", "elsewhere"}
+    left = replace(found, moved={}, removed={}, touched=())
+    for (kind, j, _), tries in exchanges:
+        if j == k and kind != "elsewhere":
+            assert list(tries(left)) == []
+
+
+def test_what_only_darkens_all_that_is_behind_it_is_no_newcomer(estimated):
     """However high the space reaches in which no photo contradicts it."""
-    _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
+    ground, olds, changed, _ = estimated
     views, body = came_to(ground, olds, changed)
     shaded = []
     for p in views:
@@ -148,9 +170,9 @@ def test_what_only_darkens_all_that_is_behind_it_is_no_newcomer(capture, tmp_pat
 
 
 @pytest.mark.parametrize("everywhere", [True, False])
-def test_dappled_light_is_what_every_photo_shows_on_the_same_surface(everywhere, capture, tmp_path, monkeypatch):
+def test_dappled_light_is_what_every_photo_shows_on_the_same_surface(everywhere, estimated):
     """However uneven it is; what each photo shows elsewhere stands before the surface."""
-    _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
+    ground, olds, changed, _ = estimated
     views, body = came_to(ground, olds, changed)
     photos = []
     for k, p in enumerate(views):
@@ -164,9 +186,9 @@ def test_dappled_light_is_what_every_photo_shows_on_the_same_surface(everywhere,
     assert bool(settle.newcomers(ground, photos, list(olds))) != everywhere
 
 
-def test_what_moved_by_less_than_can_be_seen_hides_no_newcomer(capture, tmp_path, monkeypatch):
+def test_what_moved_by_less_than_can_be_seen_hides_no_newcomer(estimated, monkeypatch):
     """It stayed, so what is behind it is asked for; else all that is there would be excused by not knowing it."""
-    _, (ground, olds, changed, found) = settled(capture, tmp_path, monkeypatch)
+    ground, olds, changed, found = estimated
     ((k, change),) = found.moved.items()
     barely = replace(change, new_from_old=turn(CENTRE, 0, (0.1 * change.pixel, 0, 0)))
     monkeypatch.setattr(settle, "place_all", lambda _g, olds, *_: ({k: barely}, dict(olds[1])))
@@ -174,9 +196,9 @@ def test_what_moved_by_less_than_can_be_seen_hides_no_newcomer(capture, tmp_path
     assert once.moved == {} and once.touched == () and not any(p.was.any() for p in once.views)
 
 
-def test_what_was_missed_at_first_is_found_among_what_arrived(capture, tmp_path, monkeypatch):
+def test_what_was_missed_at_first_is_found_among_what_arrived(estimated, monkeypatch):
     """Told as one that left and one that arrived, an object is looked for again where that is."""
-    _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
+    ground, olds, changed, _ = estimated
     monkeypatch.setattr(settle, "place_all", lambda _g, olds, *_: ({}, dict(olds[1])))
     with monkeypatch.context() as without:
         without.setattr(settle, "places_among", lambda *_: [])
@@ -200,9 +222,9 @@ def test_a_small_thing_among_much_that_changed_is_carved_finely(capture, tmp_pat
     assert float((held & true).sum() / (held | true).sum()) > 0.5
 
 
-def test_a_newcomer_is_asked_for_only_where_nothing_hides_it(capture, tmp_path, monkeypatch):
+def test_a_newcomer_is_asked_for_only_where_nothing_hides_it(estimated):
     """Of one that stands behind something else in every photo, only the rest is shown."""
-    _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
+    ground, olds, changed, _ = estimated
     views, whole = came_to(ground, olds, changed)
     hidden = []
     for p in views:
@@ -215,9 +237,9 @@ def test_a_newcomer_is_asked_for_only_where_nothing_hides_it(capture, tmp_path, 
     assert settle.fresh(hidden, rest) > 0.8 and whole.lattice.holds(grown(whole.voxels, 1), rest.places).mean() > 0.9
 
 
-def test_a_newcomer_is_judged_by_what_the_photos_show_of_it(capture, tmp_path, monkeypatch):
+def test_a_newcomer_is_judged_by_what_the_photos_show_of_it(estimated, monkeypatch):
     """It is carved with a margin: of a small one, that is more than its own pixels."""
-    _, (ground, olds, changed, _) = settled(capture, tmp_path, monkeypatch)
+    ground, olds, changed, _ = estimated
     monkeypatch.setattr(settle, "place_all", lambda _g, olds, *_: ({}, dict(olds[1])))
     (body,) = settle.Search(ground, changed)._placed(olds, Settled()).arrived
     views = settle.without(ground, changed, list(olds))
@@ -225,9 +247,9 @@ def test_a_newcomer_is_judged_by_what_the_photos_show_of_it(capture, tmp_path, m
     assert all((here & ~mask).sum() <= 0.1 * here.sum() for here, mask in shown if here.any())
 
 
-def test_places_that_are_likely_at_first_are_each_refined_to_the_end(capture, tmp_path, monkeypatch):
+def test_places_that_are_likely_at_first_are_each_refined_to_the_end(estimated, monkeypatch):
     """What looks much alike when it is turned is told apart by what is fine; one place counts once."""
-    _, (ground, (old,), changed, _) = settled(capture, tmp_path, monkeypatch)
+    ground, (old,), changed, _ = estimated
     views, middle = settle.without(ground, changed, [old]), transform(AWAY, CENTRE)
     near = [turn(middle, degrees, (0.004, 0, 0)) @ AWAY for degrees in (2, -2, 1)]
     sight = Sight(ground.field, old, views, [old])
@@ -254,9 +276,9 @@ def test_poses_that_the_photos_cannot_tell_apart_are_all_told(tmp_path):
 
 
 @pytest.mark.parametrize("shown", [True, False])
-def test_what_is_explained_less_than_it_is_shown_is_turned_right(shown, capture, tmp_path, monkeypatch):
+def test_what_is_explained_less_than_it_is_shown_is_turned_right(shown, estimated, monkeypatch):
     """Found at its place and turned wrongly: unless old photos show no more of it, all rotations are asked."""
-    _, (ground, (old,), changed, found) = settled(capture, tmp_path, monkeypatch)
+    ground, (old,), changed, found = estimated
     (k,) = found.moved
     wrongly = turn(transform(AWAY, CENTRE), 100, (0.01, 0, 0)) @ AWAY
     search = settle.Search(ground, changed)
@@ -271,8 +293,8 @@ def test_what_is_explained_less_than_it_is_shown_is_turned_right(shown, capture,
     assert (told is begun) is not shown and told.led == {k: 0.5}
 
 
-def test_a_rotation_is_taken_only_for_more_than_it_leaves_unexplained(capture, tmp_path, monkeypatch):
-    _, (ground, (old,), changed, found) = settled(capture, tmp_path, monkeypatch)
+def test_a_rotation_is_taken_only_for_more_than_it_leaves_unexplained(estimated, monkeypatch):
+    ground, (old,), changed, found = estimated
     ((k, change),) = found.moved.items()
     asked = pixels_at(ground, found, k)
     best = replace(change, explained=1.0)
@@ -286,8 +308,8 @@ def test_a_rotation_is_taken_only_for_more_than_it_leaves_unexplained(capture, t
     assert settle.Search(ground, changed)._turned_to(begun, k, []) is begun
 
 
-def test_rotations_that_explain_as_much_as_the_best_are_told_with_it(capture, tmp_path, monkeypatch):
-    _, (ground, (old,), changed, found) = settled(capture, tmp_path, monkeypatch)
+def test_rotations_that_explain_as_much_as_the_best_are_told_with_it(estimated, monkeypatch):
+    ground, (old,), changed, found = estimated
     ((k, change),) = found.moved.items()
     middle = transform(AWAY, CENTRE)
     poses = [turn(middle, degrees, (0, 0, 0)) @ AWAY for degrees in (0, 0.01, 120, 60, 90)]
@@ -298,8 +320,8 @@ def test_rotations_that_explain_as_much_as_the_best_are_told_with_it(capture, tm
     assert torch.equal(twin.new_from_old, poses[2]) and torch.equal(turned.moved[k].new_from_old, poses[0])
 
 
-def test_a_rotation_that_makes_something_else_of_the_others_is_not_taken(capture, tmp_path, monkeypatch):
-    _, (ground, (old,), changed, found) = settled(capture, tmp_path, monkeypatch)
+def test_a_rotation_that_makes_something_else_of_the_others_is_not_taken(estimated, monkeypatch):
+    ground, (old,), changed, found = estimated
     ((k, change),) = found.moved.items()
     monkeypatch.setattr(settle, "judged", lambda _, one: (replace(one, removed={k + 1: 1.0}), 0.0))
     poses = [(old, replace(change, explained=e)) for e in (0.5, 1.0)]
@@ -316,8 +338,8 @@ def test_an_estimate_tells_an_object_as_it_was_turned(capture, tmp_path, monkeyp
     assert change.objects[0].note.endswith("turned")
 
 
-def test_an_object_is_put_where_its_thickest_part_fits_among_much_that_arrived(capture, tmp_path, monkeypatch):
-    _, (ground, (old,), changed, _) = settled(capture, tmp_path, monkeypatch)
+def test_an_object_is_put_where_its_thickest_part_fits_among_much_that_arrived(estimated):
+    ground, (old,), changed, _ = estimated
     views, body = came_to(ground, [old], changed)
     small = replace(old, voxels=old.voxels & (old.lattice.centres[..., 2] < 0.08))
     (target,) = fit.targets_of(views, body, small)
@@ -326,8 +348,8 @@ def test_an_object_is_put_where_its_thickest_part_fits_among_much_that_arrived(c
     assert any((wanted > 0).any() for wanted in target.wanted)
 
 
-def test_settling_more_keeps_what_was_settled(capture, tmp_path, monkeypatch):
-    _, (ground, olds, changed, found) = settled(capture, tmp_path, monkeypatch)
+def test_settling_more_keeps_what_was_settled(estimated):
+    ground, olds, changed, found = estimated
     search = settle.Search(ground, changed)
     begun = search.settle(olds)
     again = search.settle([], begun)

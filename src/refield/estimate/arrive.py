@@ -34,7 +34,7 @@ def arrivals(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list[
     the old are gone."""
     out = []
     for hull in ground.hulls:
-        empty = Body(hull.lattice, _empty(hull.lattice, ~hull.solid, olds) & hull.free)
+        empty = Body(hull.lattice, _empty(hull.lattice.centres, ~hull.solid, olds) & hull.free)
         there = _new(empty, past, ground.carving, ground.carving.margin)
         out += [Body(hull.lattice, part) for part in components(there.voxels, 1)]
     return out
@@ -73,27 +73,28 @@ def _finer(ground: Ground, coarse: Body, past: Sequence[Past], olds: Sequence[Ol
     config, at, reach = ground.carving, coarse.places, coarse.lattice.cell
     pixel = min(float(np.linalg.norm(at - p.view.centre, axis=1).min()) * p.view.pixel_angle for p in past)
     lattice = Lattice.over(at.min(0) - reach, at.max(0) + reach, config.longest, pixel)
-    through, _ = look_behind(lattice.centres.reshape(-1, 3), [*ground.survey, *(p.view for p in past)], config)
     voxels = free_voxels(lattice, ground.planes) & coarse.lattice.holds(grown(coarse.voxels, 1), lattice.centres)
-    voxels &= _empty(lattice, through.reshape(lattice.shape), olds)
-    return _new(Body(lattice, voxels), past, config, config.margin)
+    body = _new(Body(lattice, voxels), past, config, config.margin)
+    # old photos last, since they are many: whether they look through what is left
+    through, _ = look_behind(body.places, [*ground.survey, *(p.view for p in past)], config)
+    return replace(body, voxels=some_of(body.voxels, _empty(body.places, through, olds)))
 
 
-def _empty(lattice: Lattice, air: Voxels, olds: Sequence[Old]) -> Voxels:
-    """Voxels that are ``air``, or the place of one of the old."""
+def _empty(places: Array, air: Voxels, olds: Sequence[Old]) -> Voxels:
+    """Which of some ``places`` (..., 3) are ``air`` (...), or where one of the old was."""
     for old in olds:
-        air = air | old.lattice.holds(grown(old.voxels, 1), lattice.centres)
+        air = air | old.lattice.holds(grown(old.voxels, 1), places)
     return air
 
 
 def _new(body: Body, past: Sequence[Past], config: HullConfig, margin: int) -> Body:
     """A body's voxels in every seeing view's unexplained change, grown by ``margin`` pixels."""
     seen = [(p.changed.witness(p.depth), p.changed.mask & ~p.explained) for p in past]
-    inside, against = votes(body.places, [(v, pixels.dilate(m, margin)) for v, m in seen], config)
-    sure, _ = votes(body.places, [(v, pixels.dilate(p.open, margin)) for (v, _), p in zip(seen, past)], config)
     needed = min(2, len(past))
-    which = (inside >= needed) & (sure >= needed) & (against == 0)
-    return replace(body, voxels=some_of(body.voxels, which))
+    inside, against = votes(body.places, [(v, pixels.dilate(m, margin)) for v, m in seen], config)
+    body = replace(body, voxels=some_of(body.voxels, (inside >= needed) & (against == 0)))
+    sure, _ = votes(body.places, [(v, pixels.dilate(p.open, margin)) for (v, _), p in zip(seen, past)], config)
+    return replace(body, voxels=some_of(body.voxels, sure >= needed))
 
 
 def _thick(ground: Ground, body: Body) -> list[Body]:

@@ -18,7 +18,9 @@ from scipy import ndimage
 from torch import Tensor
 
 from refield.estimate.alone import object_alone, sampler_around
+from refield.estimate.carve_kernels import Window
 from refield.estimate.detail import Detail
+from refield.estimate.drawn import drawn
 from refield.estimate.explain import Compared, Explained, explained
 from refield.estimate.kept import Kept
 from refield.estimate.lattice import grown
@@ -99,6 +101,8 @@ class Layers:
     crops: tuple[Crop, ...]
     pixel: float
     """world size of a pixel at the object"""
+    by_points: bool = False
+    """the object is drawn by its surface points, not looked up in the field"""
 
     @property
     def old(self) -> Old:
@@ -176,7 +180,7 @@ class Layers:
         return Kept(4)
 
     def _show(self, new_from_old: Tensor) -> list[Layer]:
-        alone = object_alone(self.sight.field, self.old, self._rays, new_from_old, self._sampler)
+        alone = self._alone(new_from_old)
         behind, beyond = self._behind
         hidden = self._placed < alone.depth
         front = self._in_front(alone, beyond) & ~hidden
@@ -190,9 +194,19 @@ class Layers:
 
     def cover(self, new_from_old: Tensor) -> list[Tensor]:
         """The moved object's opacity (n,) per crop, where it is in front; nothing but the object is rendered."""
-        alone = object_alone(self.sight.field, self.old, self._rays, new_from_old, self._sampler)
+        alone = self._alone(new_from_old)
         front = self._in_front(alone, torch.cat([c.beyond for c in self.crops]))
         return list(torch.where(front, alone.opacity, 0.0).split(self._sizes))
+
+    def _alone(self, new_from_old: Tensor) -> Seen:
+        if self.by_points:
+            return drawn(self.old.cloud, new_from_old, self._windows, 2 * self.pixel)
+        return object_alone(self.sight.field, self.old, self._rays, new_from_old, self._sampler)
+
+    @cached_property
+    def _windows(self) -> list[Window]:
+        depths = [c.beyond.reshape(c.shape).numpy() for c in self.crops]
+        return [Window(c.camera, c.world_from_cam, d, c.box[:2]) for c, d in zip(self.crops, depths)]
 
     def _in_front(self, alone: Seen, beyond: Tensor) -> Tensor:
         return ((beyond - alone.depth) > -self.pixel * 2) & (alone.opacity > 0.02)
@@ -274,9 +288,9 @@ class Layers:
         return shift @ exp(twist) @ invert(shift) @ new_from_old
 
 
-def layers_at(sight: Sight, start: Tensor, rays: int, turning: bool = False) -> Layers:
+def layers_at(sight: Sight, start: Tensor, rays: int, turning: bool = False, by_points: bool = False) -> Layers:
     """The photos around the place where ``start`` (4, 4) puts the object, scaled down to ``rays`` in all; ``turning``:
-    with room for it however it is rotated there."""
+    with room for it however it is rotated there; ``by_points``: as `Layers.by_points`."""
     extent = sight.old.grid.tight_aabb().double()
     if turning:
         centre = torch.from_numpy(sight.old.centre)
@@ -296,7 +310,7 @@ def layers_at(sight: Sight, start: Tensor, rays: int, turning: bool = False) -> 
         if box is not None:
             crops.append(_crop(k, p, camera, box))
             footprint.append(float(np.linalg.norm(corners.mean(0) - p.view.centre)) / camera.fx)
-    return Layers(sight, tuple(crops), float(np.median(footprint)) if footprint else 1e-3)
+    return Layers(sight, tuple(crops), float(np.median(footprint)) if footprint else 1e-3, by_points)
 
 
 def _crop(index: int, p: Past, camera: Camera, box: tuple[int, int, int, int]) -> Crop:

@@ -25,9 +25,8 @@ from refield.estimate.pose_change import FINER, SIDE, PoseChange, refine, shared
 from refield.estimate.register import super_fibonacci
 from refield.scene.pose import rigid, transform
 
-_GLANCE = 1_500  # rays over all new photos in which all rotations are compared
-_LIKELY = 0.1  # of them are compared again, in as many as the coarse refinement has
-# both chosen on five objects of two captures of one scene (docs/results.md, "Rotations compared by what they explain")
+_LIKELY = 0.1  # of all rotations, by the object's surface points, are compared by the field as well: three times as
+# many as it took to hold the best four in six objects of three worlds (docs/results.md, "Rotations by surface points")
 
 
 def may_be_turned(ground: Ground, old: Old, past: Sequence[Past], change: PoseChange) -> bool:
@@ -55,9 +54,9 @@ def _starts(ground: Ground, sight: Sight, pose: Tensor) -> list[Tensor]:
     centre = torch.from_numpy(sight.old.centre).double()
     place = transform(pose, centre)
     poses = [rigid(r, place - r @ centre) for r in torch.from_numpy(super_fibonacci(ground.search.rotations))]
-    few = ground.believe.refined
-    for rays, kept in ((_GLANCE, max(few, round(_LIKELY * len(poses)))), (ground.fine.rays[0], few)):
-        ready = layers_at(sight, pose, shared_out(rays, len(sight.past)), turning=True)
+    few, rays = ground.believe.refined, shared_out(ground.fine.rays[0], len(sight.past))
+    for by_points, kept in ((True, max(few, round(_LIKELY * len(poses)))), (False, few)):
+        ready = layers_at(sight, pose, rays, turning=True, by_points=by_points)
         poses = sorted(poses, key=lambda p: -_part(ready, p))[:kept]
     return poses
 

@@ -69,6 +69,8 @@ class Search:
     """how an object may have slid"""
     again: Kept[list[Fit]] = field(default_factory=Kept)
     """where what left may be among what arrived"""
+    completed: Kept[Settled] = field(default_factory=lambda: Kept(16))
+    """hypotheses, by what was and where it is"""
     outlined: Kept[Old | None] = field(default_factory=Kept)
     """what went along with an object, by its motion"""
     anew: dict[int, Old] = field(default_factory=dict)
@@ -167,7 +169,14 @@ class Search:
         moved, placed = place_all(ground, (kept, asked), changed, moved, (count(len(known)), self.fits))
         touched = [k for k in begun.touched if not is_piece(known[k], wholes)]
         touched += [k for k in placed if k not in touched]
-        return _completed(ground, known | placed, touched, changed, moved)
+        return self._completed(known | placed, touched, moved)
+
+    def _completed(self, known: dict[int, Old], touched: Sequence[int], moved: dict[int, PoseChange]) -> Settled:
+        """`_completed`, made once of the same objects at the same places."""
+        olds = [known[k] for k in sorted(known)]
+        placed = [one for k, change in moved.items() for one in (known[k], change)]
+        make = partial(_completed, self.ground, known, touched, self.changed, moved)
+        return self.completed.get((*olds, None, *(known[k] for k in touched), None, *placed), make)
 
     def _with(self, best: Settled, k: int, old: Old, change: PoseChange | None, rest: Old | None = None) -> Settled:
         """The hypothesis with object ``k`` as it is told here, without those that are pieces of it, and the others
@@ -187,7 +196,7 @@ class Search:
             apart.append(len(olds))
             olds[len(olds)] = rest
         moved = {j: c for j, c in best.moved.items() if j in apart and j != k}
-        return _completed(self.ground, olds, apart, self.changed, moved if change is None else moved | {k: change})
+        return self._completed(olds, apart, moved if change is None else moved | {k: change})
 
     def _without(self, best: Settled, k: int, one: Old) -> tuple[list[Old], list[Past]]:
         """What left in a hypothesis, with ``one`` for object ``k``, and the photos past that, the others taken off."""
@@ -225,6 +234,8 @@ class Search:
 
     def _joined(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object and another that went where its motion takes it as one thing."""
+        if k not in best.moved:  # no longer: another exchange was taken since
+            return
         old, change = best.olds[k], best.moved[k]
         for j, other in best.moved.items():
             pieces = sorted((old, best.olds[j]), key=id)
@@ -251,6 +262,8 @@ class Search:
 
     def _turned(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object turned where it is, as it was found at any time."""
+        if k not in best.moved:
+            return iter(())
         turned = [f for f in self.fits[k] if self._is_turned(best, k, f)]
         return self._at(best, k, [f for f in turned if not at_one_place(best.moved[k], f.change, f.old)])
 
@@ -299,7 +312,7 @@ class Search:
         rests = [j for j in inside if more or j not in self.first]
         touched = [*more, *(j for j in best.touched if j not in rests and j != k)]
         others = {j: c for j, c in best.moved.items() if j != k and j in touched}
-        return _completed(self.ground, dict(enumerate(best.olds)) | {k: one}, touched, self.changed, others)
+        return self._completed(dict(enumerate(best.olds)) | {k: one}, touched, others)
 
     def _asked(self, best: Settled) -> list[tuple[int, Old]]:
         """What may have slid about where it was, by less than its width.
