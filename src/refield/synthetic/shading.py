@@ -20,6 +20,7 @@ from refield.synthetic.visibility import first_hits
 
 _GROUND = 0.3  # of the light on a level surface comes back from it: a usual albedo
 _SUN_RAYS, _SKY_RAYS = 12, 16
+_AT_ONCE = 1 << 14  # points that rays are cast from together
 _VARNISH = 0.04  # of the light is mirrored at a varnished surface seen head-on
 _GOLDEN = np.pi * (3 - 5**0.5)
 
@@ -160,16 +161,16 @@ def _open(state: State, points: Tensor, directions: Tensor) -> Tensor:
     """(N,) the part of the directions (K, 3) in which no solid is met from each of the points (N, 3)."""
     boxes = torch.stack([item.box() for item in state.items])
     middles, radii = boxes.mean(1), (boxes[:, 1] - boxes[:, 0]).norm(dim=-1) / 2
-    offset = middles - points[:, None]  # (N, I, 3)
-    square = offset.square().sum(-1) - radii**2
     blocked = torch.zeros(len(points), dtype=torch.float64)
-    for d in directions:
-        along = offset @ d
+    for rows in torch.arange(len(points)).split(_AT_ONCE):
+        offset = middles - points[rows, None]  # (N, I, 3)
+        square = (offset.square().sum(-1) - radii**2)[..., None]
+        along = offset @ directions.T  # (N, I, K)
         # most rays pass by the solids' spheres, and need not be cast
-        near = ((square <= 0) | ((along > 0) & (along**2 >= square))).any(-1)
-        if near.any():
-            x = points[near]
-            blocked[near] += (first_hits(state, Rays(x, d.expand_as(x))).item >= 0).double()
+        near = ((square <= 0) | ((along > 0) & (along**2 >= square))).any(1)
+        n, k = near.nonzero().T
+        hit = first_hits(state, Rays(points[rows[n]], directions[k])).item >= 0
+        blocked.index_add_(0, rows[n], hit.double())
     return 1 - blocked / len(directions)
 
 
