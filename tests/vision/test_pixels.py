@@ -43,6 +43,18 @@ def test_exposure_is_fitted_though_a_third_of_the_pixels_changed():
     np.testing.assert_allclose(image[30:] * fit[0] + fit[1], other[30:], atol=0.01)
 
 
+def test_exposure_is_fitted_though_more_than_half_changed_and_the_rest_is_hardly_textured():
+    """What a field has not learnt of the ground's texture is noise to it, along which a line would be flat."""
+    rng = np.random.default_rng(1)
+    ground = np.array([0.25, 0.45, 0.5]) + 0.03 * rng.standard_normal((64, 64, 1))
+    photo = ground + 0.03 * rng.standard_normal((64, 64, 1))
+    photo[:38] = np.clip(0.5 + 0.2 * rng.standard_normal((38, 64, 3)), 0.05, 0.95)
+    field = 1.1 * ground
+    field[:38] = np.clip(0.5 + 0.2 * rng.standard_normal((38, 64, 3)), 0.05, 0.95)
+    gain, offset = pixels.fit_colours(photo, field)
+    assert np.abs(gain - 1.1).max() < 0.35 and np.abs((photo * gain + offset - field)[38:].mean((0, 1))).max() < 0.01
+
+
 def test_exposure_stays_when_there_is_nothing_to_fit():
     black = np.zeros((8, 8, 3), np.float32)
     np.testing.assert_array_equal(pixels.fit_colours(black, black), [[1, 1, 1], [0, 0, 0]])

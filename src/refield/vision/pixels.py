@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from refield.vision.pixel_kernels import find_nearest
 
@@ -130,28 +131,44 @@ def bounding_box(mask: Mask, margin: int = 0) -> tuple[int, int, int, int] | Non
     )
 
 
+def _likeliest_gain(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The gain per channel, (3,), by which most colours (N, 3) are carried to others; within half and double."""
+    ratio = np.log(y / x)
+    most, steps = np.log(2.0), 70  # of about 2 %
+    counted, edges = np.histogram(ratio.mean(-1), steps, (-most, most))
+    there = gaussian_filter1d(counted.astype(np.float64), 2.0, mode="constant")
+    middle = (edges[there.argmax()] + edges[there.argmax() + 1]) / 2
+    near = np.abs(ratio.mean(-1) - middle) < 0.1
+    return np.exp(np.clip(np.median(ratio[near], axis=0), -most, most)) if near.any() else np.ones(3)
+
+
+def _line(x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gain and offset per channel, (2, 3), of colours (N, 3) by others: a straight line as far as the two go together
+    (by their squared correlation), and no offset as far as they do not; what is noise in ``x`` would flatten a line."""
+    w = weight[:, None] / weight.sum()
+    mean_x, mean_y = (w * x).sum(0), (w * y).sum(0)
+    dx, dy = x - mean_x, y - mean_y
+    along, of_x, of_y = (w * dx * dy).sum(0), (w * dx**2).sum(0), (w * dy**2).sum(0)
+    together = np.clip(along, 0, None) ** 2 / np.maximum(of_x * of_y, 1e-12)
+    gain = together * along / np.maximum(of_x, 1e-9) + (1 - together) * (w * x * y).sum(0) / (w * x**2).sum(0)
+    slope = along / np.maximum(of_x, 1e-9)
+    return np.stack([gain, together * (mean_y - slope * mean_x)])
+
+
 def fit_colours(source: Image, target: Image, rounds: int = 8) -> NDArray[np.float64]:
     """Gain and offset per channel, (2, 3), that carry ``source`` to ``target`` where the two show the same.
 
-    Robust: iteratively reweighted, so that up to about half the pixels may show something else. Stays at
-    (1, 0) where the pixels say nothing (too dark, saturated or flat).
+    Robust: begun with the gain that most pixels have and reweighted by what the better ones leave, so that more than
+    half of the pixels may show something else. Stays at (1, 0) where they say nothing (too dark, saturated or flat).
     """
     out = np.stack([np.ones(3), np.zeros(3)])
     usable = np.all((source > 0.02) & (source < 0.98) & (target > 0.02) & (target < 0.98), axis=-1)
     if usable.sum() < 50:
         return out
     x, y = source[usable].astype(np.float64), target[usable].astype(np.float64)
-    ratio = np.median(y / x, axis=0)
-    out[0] = np.where((ratio > 0.5) & (ratio < 2.0), ratio, 1.0)
-    prior = 0.02 * len(x)
+    out[0] = _likeliest_gain(x, y)
     for _ in range(rounds):
-        r = x * out[0] + out[1] - y
-        error = np.sqrt((r**2).sum(-1))
-        scale = max(float(np.median(error)) * 1.5, 0.01)
-        w = 1 / (1 + (error / scale) ** 2) ** 2
-        for c in range(3):
-            a = np.stack([x[:, c], np.ones(len(x))], -1)
-            normal = (a * w[:, None]).T @ a + np.diag([prior * 1e-3, prior * 1e-2])
-            rhs = (a * w[:, None]).T @ y[:, c] + np.array([prior * 1e-3, 0.0])
-            out[:, c] = np.linalg.solve(normal, rhs)
+        error = np.sqrt(((x * out[0] + out[1] - y) ** 2).sum(-1))
+        scale = max(2.1 * float(np.quantile(error, 0.25)), 0.01)
+        out = _line(x, y, 1 / (1 + (error / scale) ** 2) ** 2)
     return out
