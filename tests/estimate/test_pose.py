@@ -159,7 +159,8 @@ def turning(stage):
 def test_an_object_is_drawn_by_its_points_about_as_its_field_shows_it(stage):
     """With its colours, at its distance, nothing of its back; with gaps where its points are sparser than pixels."""
     sight = Sight(stage.scene.field, stage.old, stage.past, [stage.old])
-    (field, points) = (layers_at(sight, TRUE, 8_000, by_points=drawn) for drawn in (False, True))
+    field = layers_at(sight, TRUE, 8_000)
+    points = replace(field, by_points=True)
     for looked_up, drawn in zip(field.show(TRUE), points.show(TRUE)):
         solid, found = (layer.opacity > 0.5 for layer in (looked_up, drawn))
         both = solid & found

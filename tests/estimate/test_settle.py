@@ -157,6 +157,20 @@ def test_what_was_asked_of_an_object_that_moved_is_not_asked_once_it_has_not(est
             assert list(tries(left)) == []
 
 
+def test_a_hypothesis_is_made_once_and_told_from_those_that_differ_in_anything(estimated, monkeypatch):
+    ground, (old,), changed, found = estimated
+    ((_, change),) = found.moved.items()
+    made = []
+    monkeypatch.setattr(settle, "_completed", lambda *asked: made.append(asked) or Settled())
+    search, other = settle.Search(ground, changed), replace(old)
+    both, moved = {0: old, 1: other}, {0: change}
+    asked = [({0: old}, [0], {}), (both, [0], {}), (both, [1], {}), (both, [0, 1], {}), (both, [1, 0], {})]
+    asked += [(both, [0, 1], moved), (both, [0, 1], {0: replace(change)}), (both, [0, 1], {1: change})]
+    answers = [search._hypothesis(*one) for one in asked]
+    assert len(made) == len(asked)
+    assert all(search._hypothesis(*one) is answer for one, answer in zip(asked, answers)) and len(made) == len(asked)
+
+
 def test_what_only_darkens_all_that_is_behind_it_is_no_newcomer(estimated):
     """However high the space reaches in which no photo contradicts it."""
     ground, olds, changed, _ = estimated

@@ -17,7 +17,7 @@ from refield.estimate.detect import Mask, difference
 from refield.estimate.explain import LIMIT
 from refield.estimate.ground import Ground
 from refield.estimate.hull import HullConfig, look_behind, votes
-from refield.estimate.lattice import EVERY_WAY, Body, Lattice, Voxels, components, grown, some_of
+from refield.estimate.lattice import EVERY_WAY, Body, Lattice, components, grown, some_of
 from refield.estimate.light import Ratio, brighter, light_of_others
 from refield.estimate.look import Array, View
 from refield.estimate.objects import Old
@@ -80,7 +80,7 @@ def _finer(ground: Ground, coarse: Body, past: Sequence[Past], olds: Sequence[Ol
     return replace(body, voxels=some_of(body.voxels, _empty(body.places, through, olds)))
 
 
-def _empty(places: Array, air: Voxels, olds: Sequence[Old]) -> Voxels:
+def _empty(places: Array, air: Mask, olds: Sequence[Old]) -> Mask:
     """Which of some ``places`` (..., 3) are ``air`` (...), or where one of the old was."""
     for old in olds:
         air = air | old.lattice.holds(grown(old.voxels, 1), places)

@@ -25,7 +25,7 @@ _F64 = NDArray[Any]
 _Bool = NDArray[Any]
 _Count = NDArray[Any]
 # not all of fastmath: depths may be infinite and points not numbers
-JIT: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "cache": True, "error_model": "numpy"}
+_JIT: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz", "arcp"}, "cache": True, "error_model": "numpy"}
 
 
 class Window(NamedTuple):
@@ -53,8 +53,8 @@ def packed(windows: Iterable[Window]) -> tuple[_F64, _F32]:
     return np.array(rows, np.float64).reshape(-1, 26), np.concatenate(depths, dtype=np.float32)
 
 
-@njit(**JIT)
-def look_up(lens: _F64, x: float, y: float, z: float) -> tuple[int, float]:
+@njit(**_JIT)
+def _look(lens: _F64, x: float, y: float, z: float) -> tuple[int, float]:
     """A world point -> the pixel it falls on, counted among P (-1: on none), and its distance."""
     zc = lens[6] * x + lens[7] * y + lens[8] * z + lens[11]
     if not zc > 1e-6:
@@ -73,7 +73,7 @@ def look_up(lens: _F64, x: float, y: float, z: float) -> tuple[int, float]:
     return pixel, math.sqrt(xc * xc + yc * yc + zc * zc)
 
 
-@njit(parallel=True, **JIT)
+@njit(parallel=True, **_JIT)
 def count_votes(
     points: _F32, lenses: _F64, depths: _F32, slack: _F64, masks: _Bool, shown: _Count, against: _Count
 ) -> None:
@@ -83,7 +83,7 @@ def count_votes(
     for n in prange(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         for v in range(len(lenses)):
-            at, distance = look_up(lenses[v], x, y, z)
+            at, distance = _look(lenses[v], x, y, z)
             if at >= 0:
                 if masks[at]:
                     shown[n] += 1
@@ -91,7 +91,7 @@ def count_votes(
                     against[n] += 1
 
 
-@njit(parallel=True, **JIT)
+@njit(parallel=True, **_JIT)
 def find_behind(points: _F32, lenses: _F64, depths: _F32, slack: _F64, through: _Bool, behind: _F32) -> None:
     """``through`` (N,): whether some window looks through a point; ``behind`` (N,): how far behind the surface it is in
     the window that comes nearest to it, inf if none shows a surface there."""
@@ -99,7 +99,7 @@ def find_behind(points: _F32, lenses: _F64, depths: _F32, slack: _F64, through: 
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         passed, least = False, np.inf
         for v in range(len(lenses)):
-            at, distance = look_up(lenses[v], x, y, z)
+            at, distance = _look(lenses[v], x, y, z)
             if at >= 0:
                 front = depths[at]
                 passed |= distance < front - slack[v] * distance
@@ -108,20 +108,20 @@ def find_behind(points: _F32, lenses: _F64, depths: _F32, slack: _F64, through: 
         through[n], behind[n] = passed, least
 
 
-@njit(parallel=True, **JIT)
+@njit(parallel=True, **_JIT)
 def count_on_surface(points: _F32, lenses: _F64, depths: _F32, slack: _F64, far: float, out: _Count) -> None:
     """``out`` (N,): the windows that show a surface where each point lies; of points beyond ``far``, those that show
     nothing there."""
     for n in prange(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         for v in range(len(lenses)):
-            at, distance = look_up(lenses[v], x, y, z)
+            at, distance = _look(lenses[v], x, y, z)
             if at >= 0:
                 front = depths[at]
                 out[n] += abs(front - distance) < slack[v] * distance or (front == np.inf and distance > far)
 
 
-@njit(parallel=True, **JIT)
+@njit(parallel=True, **_JIT)
 def find_solid(
     points: _F32, lenses: _F64, depths: _F32, margin: float, allowed: float, deepest: float, out: _Bool
 ) -> None:
@@ -131,7 +131,7 @@ def find_solid(
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         passed, least = 0, np.inf
         for v in range(len(lenses)):
-            at, distance = look_up(lenses[v], x, y, z)
+            at, distance = _look(lenses[v], x, y, z)
             if at >= 0:
                 behind = distance - depths[at]
                 passed += behind < -margin
@@ -141,7 +141,7 @@ def find_solid(
         out[n] = passed <= allowed and least < deepest
 
 
-@njit(parallel=True, **JIT)
+@njit(parallel=True, **_JIT)
 def find_held(points: _F32, voxels: _Bool, low: _F32, cell: float, out: _Bool) -> None:
     """``out`` (N,): whether a point lies in one of the voxels (X, Y, Z); the first has its centre at ``low``."""
     nx, ny, nz = voxels.shape
@@ -153,7 +153,7 @@ def find_held(points: _F32, voxels: _Bool, low: _F32, cell: float, out: _Bool) -
             out[n] = voxels[int(i), int(j), int(k)]
 
 
-@njit(parallel=True, **JIT)
+@njit(parallel=True, **_JIT)
 def spread(voxels: _Bool, steps: int, out: _Bool) -> None:
     """Voxels (X, Y, Z) and all that are at most ``steps`` from one along every axis -> out, false at first."""
     nx, ny, nz = voxels.shape
@@ -177,3 +177,29 @@ def spread(voxels: _Bool, steps: int, out: _Bool) -> None:
                 for j in range(ny):
                     for k in range(nz):
                         out[i, j, k] |= flat[other, j, k]
+
+
+@njit(parallel=True, **_JIT)
+def draw_points(
+    points: _F64, normals: _F64, colours: _F32, lenses: _F64, eyes: _F64, thickness: float, depth: _F32, total: _F32
+) -> None:
+    """``depth`` (P,), inf at first: the nearest of the points on each pixel that face it; ``total`` (P, 4), 0 at first:
+    the colours (N, 3) and the number of those that are no more than ``thickness`` behind it. eyes (V, 3): where windows
+    look from; normals (N, 3).
+    """
+    for v in prange(len(lenses)):
+        for nearest in (True, False):
+            for n in range(len(points)):
+                x, y, z = points[n, 0], points[n, 1], points[n, 2]
+                ex, ey, ez = x - eyes[v, 0], y - eyes[v, 1], z - eyes[v, 2]
+                if ex * normals[n, 0] + ey * normals[n, 1] + ez * normals[n, 2] >= 0:
+                    continue
+                at, distance = _look(lenses[v], x, y, z)
+                if at < 0:
+                    continue
+                if nearest:
+                    depth[at] = min(depth[at], distance)
+                elif distance <= depth[at] + thickness:
+                    for k in range(3):
+                        total[at, k] += colours[n, k]
+                    total[at, 3] += 1

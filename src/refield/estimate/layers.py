@@ -288,9 +288,9 @@ class Layers:
         return shift @ exp(twist) @ invert(shift) @ new_from_old
 
 
-def layers_at(sight: Sight, start: Tensor, rays: int, turning: bool = False, by_points: bool = False) -> Layers:
+def layers_at(sight: Sight, start: Tensor, rays: int, turning: bool = False) -> Layers:
     """The photos around the place where ``start`` (4, 4) puts the object, scaled down to ``rays`` in all; ``turning``:
-    with room for it however it is rotated there; ``by_points``: as `Layers.by_points`."""
+    with room for it however it is rotated there."""
     extent = sight.old.grid.tight_aabb().double()
     if turning:
         centre = torch.from_numpy(sight.old.centre)
@@ -310,7 +310,7 @@ def layers_at(sight: Sight, start: Tensor, rays: int, turning: bool = False, by_
         if box is not None:
             crops.append(_crop(k, p, camera, box))
             footprint.append(float(np.linalg.norm(corners.mean(0) - p.view.centre)) / camera.fx)
-    return Layers(sight, tuple(crops), float(np.median(footprint)) if footprint else 1e-3, by_points)
+    return Layers(sight, tuple(crops), float(np.median(footprint)) if footprint else 1e-3)
 
 
 def _crop(index: int, p: Past, camera: Camera, box: tuple[int, int, int, int]) -> Crop:

@@ -54,10 +54,14 @@ def _starts(ground: Ground, sight: Sight, pose: Tensor) -> list[Tensor]:
     centre = torch.from_numpy(sight.old.centre).double()
     place = transform(pose, centre)
     poses = [rigid(r, place - r @ centre) for r in torch.from_numpy(super_fibonacci(ground.search.rotations))]
-    few, rays = ground.believe.refined, shared_out(ground.fine.rays[0], len(sight.past))
-    for by_points, kept in ((True, max(few, round(_LIKELY * len(poses)))), (False, few)):
-        ready = layers_at(sight, pose, rays, turning=True, by_points=by_points)
-        poses = sorted(poses, key=lambda p: -_part(ready, p))[:kept]
+    few = ground.believe.refined
+    by_field = layers_at(sight, pose, shared_out(ground.fine.rays[0], len(sight.past)), turning=True)
+    by_points = replace(by_field, by_points=True)
+    for ready, kept in ((by_points, max(few, round(_LIKELY * len(poses)))), (by_field, few)):
+        parts = [_part(ready, p) for p in poses]
+        if ready is by_points and not any(parts):  # so few, or so far apart, that they tell nothing
+            continue
+        poses = [poses[k] for k in np.argsort(parts, kind="stable")[::-1][:kept]]
     return poses
 
 

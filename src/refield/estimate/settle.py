@@ -69,8 +69,8 @@ class Search:
     """how an object may have slid"""
     again: Kept[list[Fit]] = field(default_factory=Kept)
     """where what left may be among what arrived"""
-    completed: Kept[Settled] = field(default_factory=lambda: Kept(16))
-    """hypotheses, by what was and where it is"""
+    hypotheses: Kept[Settled] = field(default_factory=lambda: Kept(16))
+    """by what was, what was touched and where it is"""
     outlined: Kept[Old | None] = field(default_factory=Kept)
     """what went along with an object, by its motion"""
     anew: dict[int, Old] = field(default_factory=dict)
@@ -169,14 +169,15 @@ class Search:
         moved, placed = place_all(ground, (kept, asked), changed, moved, (count(len(known)), self.fits))
         touched = [k for k in begun.touched if not is_piece(known[k], wholes)]
         touched += [k for k in placed if k not in touched]
-        return self._completed(known | placed, touched, moved)
+        return self._hypothesis(known | placed, touched, moved)
 
-    def _completed(self, known: dict[int, Old], touched: Sequence[int], moved: dict[int, PoseChange]) -> Settled:
-        """`_completed`, made once of the same objects at the same places."""
+    def _hypothesis(self, known: dict[int, Old], touched: Sequence[int], moved: dict[int, PoseChange]) -> Settled:
+        """What `_completed` makes of it, made once of the same objects, of which none is known by two indices, with the
+        same poses: without one object the others are often asked again."""
         olds = [known[k] for k in sorted(known)]
         placed = [one for k, change in moved.items() for one in (known[k], change)]
         make = partial(_completed, self.ground, known, touched, self.changed, moved)
-        return self.completed.get((*olds, None, *(known[k] for k in touched), None, *placed), make)
+        return self.hypotheses.get((*olds, None, *(known[k] for k in touched), None, *placed), make)
 
     def _with(self, best: Settled, k: int, old: Old, change: PoseChange | None, rest: Old | None = None) -> Settled:
         """The hypothesis with object ``k`` as it is told here, without those that are pieces of it, and the others
@@ -196,7 +197,7 @@ class Search:
             apart.append(len(olds))
             olds[len(olds)] = rest
         moved = {j: c for j, c in best.moved.items() if j in apart and j != k}
-        return self._completed(olds, apart, moved if change is None else moved | {k: change})
+        return self._hypothesis(olds, apart, moved if change is None else moved | {k: change})
 
     def _without(self, best: Settled, k: int, one: Old) -> tuple[list[Old], list[Past]]:
         """What left in a hypothesis, with ``one`` for object ``k``, and the photos past that, the others taken off."""
@@ -234,7 +235,7 @@ class Search:
 
     def _joined(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object and another that went where its motion takes it as one thing."""
-        if k not in best.moved:  # no longer: another exchange was taken since
+        if k not in best.moved:  # no longer: another exchange was taken since this one was listed
             return
         old, change = best.olds[k], best.moved[k]
         for j, other in best.moved.items():
@@ -262,7 +263,7 @@ class Search:
 
     def _turned(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object turned where it is, as it was found at any time."""
-        if k not in best.moved:
+        if k not in best.moved:  # no longer, as in `_joined`
             return iter(())
         turned = [f for f in self.fits[k] if self._is_turned(best, k, f)]
         return self._at(best, k, [f for f in turned if not at_one_place(best.moved[k], f.change, f.old)])
@@ -312,7 +313,7 @@ class Search:
         rests = [j for j in inside if more or j not in self.first]
         touched = [*more, *(j for j in best.touched if j not in rests and j != k)]
         others = {j: c for j, c in best.moved.items() if j != k and j in touched}
-        return self._completed(dict(enumerate(best.olds)) | {k: one}, touched, others)
+        return self._hypothesis(dict(enumerate(best.olds)) | {k: one}, touched, others)
 
     def _asked(self, best: Settled) -> list[tuple[int, Old]]:
         """What may have slid about where it was, by less than its width.

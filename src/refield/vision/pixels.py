@@ -132,39 +132,50 @@ def bounding_box(mask: Mask, margin: int = 0) -> tuple[int, int, int, int] | Non
 
 
 def _likeliest_gain(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The gain per channel, (3,), by which most colours (N, 3) are carried to others; within half and double."""
+    """The gain per channel, (3,), about which most colours (N, 3) are carried to others, within half and double."""
     ratio = np.log(y / x)
-    most, steps = np.log(2.0), 70  # of about 2 %
-    counted, edges = np.histogram(ratio.mean(-1), steps, (-most, most))
-    there = gaussian_filter1d(counted.astype(np.float64), 2.0, mode="constant")
-    middle = (edges[there.argmax()] + edges[there.argmax() + 1]) / 2
-    near = np.abs(ratio.mean(-1) - middle) < 0.1
-    return np.exp(np.clip(np.median(ratio[near], axis=0), -most, most)) if near.any() else np.ones(3)
+    grey = ratio.mean(-1)
+    most, near = np.log(2.0), 0.1
+    counted, edges = np.histogram(grey, 70, (-most, most))
+    if not counted.any():
+        return np.ones(3)
+    width = near / 2 / (edges[1] - edges[0])  # ground whose texture is not learnt is that wide, one even thing is not
+    k = int(gaussian_filter1d(counted.astype(np.float64), width, mode="constant").argmax())
+    alike = np.abs(grey - (edges[k] + edges[k + 1]) / 2) < near
+    return np.exp(np.clip(np.median(ratio[alike], axis=0), -most, most)) if alike.any() else np.ones(3)
 
 
 def _line(x: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
     """Gain and offset per channel, (2, 3), of colours (N, 3) by others: a straight line as far as the two go together
-    (by their squared correlation), and no offset as far as they do not; what is noise in ``x`` would flatten a line."""
+    (by their squared correlation), and the quotient of their means as far as they do not; what is noise in ``x`` would
+    flatten a line."""
     w = weight[:, None] / weight.sum()
     mean_x, mean_y = (w * x).sum(0), (w * y).sum(0)
     dx, dy = x - mean_x, y - mean_y
     along, of_x, of_y = (w * dx * dy).sum(0), (w * dx**2).sum(0), (w * dy**2).sum(0)
     together = np.clip(along, 0, None) ** 2 / np.maximum(of_x * of_y, 1e-12)
-    gain = together * along / np.maximum(of_x, 1e-9) + (1 - together) * (w * x * y).sum(0) / (w * x**2).sum(0)
-    slope = along / np.maximum(of_x, 1e-9)
-    return np.stack([gain, together * (mean_y - slope * mean_x)])
+    gain = together * along / np.maximum(of_x, 1e-9) + (1 - together) * mean_y / mean_x
+    return np.stack([gain, mean_y - gain * mean_x])
 
 
 def fit_colours(source: Image, target: Image, rounds: int = 8) -> NDArray[np.float64]:
     """Gain and offset per channel, (2, 3), that carry ``source`` to ``target`` where the two show the same.
 
-    Robust: begun with the gain that most pixels have and reweighted by what the better ones leave, so that more than
-    half of the pixels may show something else. Stays at (1, 0) where they say nothing (too dark, saturated or flat).
+    Robust: begun with the gain about which most pixels are, and reweighted by what the better ones leave, so that more
+    than half may show something else, unless that is more alike. (1, 0) where too few are neither dark nor saturated.
     """
     out = np.stack([np.ones(3), np.zeros(3)])
     usable = np.all((source > 0.02) & (source < 0.98) & (target > 0.02) & (target < 0.98), axis=-1)
     if usable.sum() < 50:
         return out
+    x, y = source[usable].astype(np.float64), target[usable].astype(np.float64)
+    out[0] = _likeliest_gain(x, y)
+    for _ in range(rounds):
+        error = np.sqrt(((x * out[0] + out[1] - y) ** 2).sum(-1))
+        # of normal errors in three channels 1.5 times their median, but asked of the better half
+        scale = max(2.1 * float(np.quantile(error, 0.25)), 0.01)
+        out = _line(x, y, 1 / (1 + (error / scale) ** 2) ** 2)
+    return out
     x, y = source[usable].astype(np.float64), target[usable].astype(np.float64)
     out[0] = _likeliest_gain(x, y)
     for _ in range(rounds):
