@@ -176,10 +176,3 @@ def fit_colours(source: Image, target: Image, rounds: int = 8) -> NDArray[np.flo
         scale = max(2.1 * float(np.quantile(error, 0.25)), 0.01)
         out = _line(x, y, 1 / (1 + (error / scale) ** 2) ** 2)
     return out
-    x, y = source[usable].astype(np.float64), target[usable].astype(np.float64)
-    out[0] = _likeliest_gain(x, y)
-    for _ in range(rounds):
-        error = np.sqrt(((x * out[0] + out[1] - y) ** 2).sum(-1))
-        scale = max(2.1 * float(np.quantile(error, 0.25)), 0.01)
-        out = _line(x, y, 1 / (1 + (error / scale) ** 2) ** 2)
-    return out
