@@ -209,3 +209,11 @@ def test_pages_of_other_sites_are_refused(work):
             assert ours.recv(timeout=10)
         with pytest.raises(InvalidStatus, match="403"), connect(address, origin="http://evil.example"):
             pass
+
+
+def test_who_has_gone_is_drawn_for_without_a_word():
+    from refield.view.server import opened_server, stop
+
+    server = opened_server(0)
+    stop(server)
+    server.scene.set_background_image(np.zeros((4, 4, 3), np.uint8), format="jpeg")  # a warning is an error in tests

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import io
 import re
+import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -106,6 +107,8 @@ def opened_server(port: int) -> ViserServer:
 
     if not 0 <= port <= 65535:
         raise InputError("--port", f"{port} is none", "give 0 (any that is free) to 65535")
+    # A browser may go while a picture for it is on its way, which nobody can know before: that is no fault.
+    warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
     with _for_our_pages_alone(), contextlib.redirect_stdout(io.StringIO()):
         return viser.ViserServer(host=HOST, port=port, verbose=False)
 
