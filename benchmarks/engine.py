@@ -173,7 +173,7 @@ def _fit_job(job: Row) -> Row:
     if job["runner"] in ("refield", "twin"):
         every = 100 if job["runner"] == "refield" else 10
         most = FitConfig().steps if job["runner"] == "refield" else 100_000
-        fit_field(capture, FitConfig(steps=most, max_seconds=seconds, check_every=every, patience=10**6), look)
+        fit_field(capture, FitConfig(steps=most, max_seconds=seconds, check_every=every), look)
     else:
         shape, rays = NerfactoConfig(), 4096
         if "reduced" in job["runner"]:
@@ -446,7 +446,7 @@ def _cost_job(job: Row) -> Row:
     from refield.scene.transforms_json import load_transforms
 
     capture = load_transforms(_photos(job), decode=False)
-    config = FitConfig(steps=job["steps"], field=HashFieldConfig(log2_table=job["table"]), patience=10**6)
+    config = FitConfig(steps=job["steps"], field=HashFieldConfig(log2_table=job["table"]))
     looks: list[Any] = []
     began = time.perf_counter()
     field = fit_field(capture, config, looks.append)

@@ -266,9 +266,8 @@ def run_engine(report: Any, asked: argparse.Namespace, device: Any) -> None:
     capture = the_capture(asked, device)
     if asked.child == "fit":
         steps, every = asked.steps or FitConfig.steps, asked.check_every
-        patience = max(1, FitConfig.patience * FitConfig.check_every // every)  # as many steps as by default
         configs = {
-            name: FitConfig(steps=steps, check_every=every, patience=patience, field=field)
+            name: FitConfig(steps=steps, check_every=every, field=field)
             for name, field in shapes(asked, fitted=True).items()
         }
         if asked.dry_run:

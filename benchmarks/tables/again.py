@@ -151,7 +151,7 @@ def _again(case: Case, since: Since, directions: bool = False, steps: int = 1) -
     fit = FitConfig(directions=directions, seed=case.seed)
     if steps == 1:
         return retrain(case.capture, case.change, fit, since=since), {}
-    fit = replace(fit, steps=steps * fit.steps, patience=10**6)
+    fit = replace(fit, steps=steps * fit.steps)
     curve = Curve(_seen_in_time(case.scene.folder / "data" / "eval"), looks_until(fit.steps, _LOOKS))
     field = retrain(case.capture, case.change, fit, curve, since)
     return field, {"curve": [asdict(p) for p in curve.points]}

@@ -263,7 +263,7 @@ def retrained_long(lab: Lab, case: Case) -> Record:
     first, ours, usual = (run_method(lab, case, m) for m in ("estimate", "ours", "retrained"))
     seconds = max(WHOLE * (first["total"] + ours["train"]), TRAINING * ours["seconds"]["train"])
     steps = math.ceil(_SPARE * seconds * usual["steps"] / usual["train"])
-    config = replace(lab.fit, steps=max(steps, 1), patience=10**6)
+    config = replace(lab.fit, steps=max(steps, 1))
     return _trained(
         lab, case, "retrained_long", lambda change, curve: retrain(case.capture, change, config, curve), config.steps
     )

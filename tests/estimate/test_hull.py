@@ -13,7 +13,7 @@ from refield.estimate.hull import HullConfig, carve, find_regions
 from refield.estimate.lattice import Lattice, components
 from refield.estimate.look import median_depth, view_of
 from refield.field.volrend import Samples
-from refield.scene.planes import Plane, _edges, rough_planes, rough_tops, support_planes
+from refield.scene.planes import EXACT, Plane, _edges, rough_planes, support_planes, support_tops
 from tests.estimate.boxes import BoxWorld, camera_at, photograph, standing
 
 CRATE = standing((0.2, 0.17, 0.18), -0.1, -0.1, 20)
@@ -147,7 +147,7 @@ def table_and_floor(count=4000, seed=0):
 def test_a_table_top_ends_and_the_floor_is_seen_beside_it():
     points, eyes = table_and_floor()
     everything = np.ones(len(points), bool)
-    top = next(p for p in rough_tops(points, eyes, everything, 0.012) if p.offset > 0.5)
+    top = next(p for p in support_tops(points, eyes, everything, EXACT * 0.012) if p.offset > 0.5)
     np.testing.assert_allclose(top.normal, [0, 0, 1], atol=0.02)
     assert top.offset == pytest.approx(0.7, abs=0.005)
     asked = np.array([[0, 0, 0.9], [0.4, -0.4, 0.5], [0.9, 0, 0.5], [0, -1.2, 0.9]], np.float32)
@@ -158,13 +158,15 @@ def test_a_table_top_ends_and_the_floor_is_seen_beside_it():
 def test_what_moved_holds_nothing_up():
     points, eyes = table_and_floor()
     still = points[:, 2] < 0.5
-    assert not any(p.offset > 0.5 for p in rough_tops(points, eyes, still, 0.012))
+    for rough in (1, 2, 4):
+        assert not any(p.offset > 0.5 for p in support_tops(points, eyes, still, rough * EXACT * 0.012))
 
 
 def test_a_slice_of_what_fills_space_is_no_plane():
     points = np.random.default_rng(0).uniform(0, 0.1, (4000, 3)).astype(np.float32)
     eyes = np.tile(np.array([0.05, 0.05, 3], np.float32), (4000, 1))
-    assert rough_tops(points, eyes, np.ones(4000, bool), 0.004) == []
+    for rough in (1, 2, 4):
+        assert support_tops(points, eyes, np.ones(4000, bool), rough * EXACT * 0.004) == []
 
 
 def test_a_strip_of_points_has_edges_too():

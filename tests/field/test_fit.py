@@ -27,7 +27,7 @@ from refield.field.placing import opened, place_contraction
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.render import render_frame, render_many, render_rays
 from refield.field.sampling import IN_PICTURES
-from refield.field.schedule import at_plateau, rate_factor
+from refield.field.schedule import rate_factor
 from refield.scene.camera import Camera
 from refield.scene.capture import Capture, Frame, camera_rays
 from refield.scene.change import OccupancyGrid
@@ -264,14 +264,6 @@ def test_learning_rate_is_held_then_falls() -> None:
     assert rate_factor(0.0) == rate_factor(0.5) == 1
     assert 0.03 < rate_factor(1.0) < 0.04
     assert rate_factor(0.9) < rate_factor(0.7) < 1
-
-
-def test_training_ends_when_held_out_pixels_stop_gaining() -> None:
-    config = FitConfig(patience=2, least_gain=0.1)
-    assert not at_plateau([20.0, 20.0], config)  # too few looks to say
-    assert not at_plateau([20.0, 20.05, 20.1], config)
-    assert at_plateau([20.0, 20.05, 20.09], config)
-    assert at_plateau([22.0, 20.0, 21.0], config)
 
 
 def broken(monkeypatch: pytest.MonkeyPatch, bad: Callable[[int], bool], gradient: bool) -> list[int]:

@@ -21,7 +21,7 @@ from refield.scene.images import write_image
 from refield.update import fit_textured, relight, supervision, train
 from refield.update.config import UpdateConfig
 from refield.update.cut import CutConfig
-from refield.update.fit_helper import HelperConfig, HelperTraining, Lit
+from refield.update.fit_helper import HelperConfig, HelperTraining, Lit, at_plateau
 from refield.update.frozen import FreezeConfig
 from refield.update.ground import GroundConfig
 from refield.update.light import Relighting, Sightings
@@ -277,3 +277,11 @@ def test_light_stays_where_no_photo_shows_what_left(
     updated = update_field(capture, OLD_FIELD, change, QUICK)
     assert updated.light is light and updated.shading[0] is light and updated.helper is None
     assert "nothing could be learnt" in updated.why_stopped
+
+
+def test_training_ends_when_held_out_pixels_stop_gaining() -> None:
+    config = HelperConfig(patience=2, least_gain=0.1)
+    assert not at_plateau([20.0, 20.0], config)  # too few looks to say
+    assert not at_plateau([20.0, 20.05, 20.1], config)
+    assert at_plateau([20.0, 20.05, 20.09], config)
+    assert at_plateau([22.0, 20.0, 21.0], config)

@@ -27,7 +27,7 @@ from refield.field.photos import Photos
 from refield.field.placing import COLOUR_IN, DIRECTED, stand_outside
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP
-from refield.field.schedule import at_plateau, rate_factor
+from refield.field.schedule import rate_factor
 from refield.scene.capture import Capture
 
 _BATCH = 32  # times the samples of a step on a CPU: fewer would leave most of the chip idle
@@ -128,7 +128,6 @@ class _GpuFit:
 
     def _steps(self) -> int:
         """All rounds of steps, each followed by what a graph cannot hold; returns the samples of the last step."""
-        looks: list[float] = []
         due = self.config.check_every
         graph, step = self._captured(0)
         while self._progress(step) < 1:
@@ -141,9 +140,7 @@ class _GpuFit:
                 raise NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
             if step >= due:
                 due += self.config.check_every
-                looks.append(self._look(step, samples / self.rays_per_step))
-                if at_plateau(looks, self.config):
-                    break
+                self._look(step, samples / self.rays_per_step)
             if self._resized(samples) or self.photos.stage(self._expose(step)) != stage:
                 graph, step = self._captured(step)
         return int(graph.samples)
@@ -217,13 +214,13 @@ class _GpuFit:
             self.rays_per_step = wanted
         return (self.rays_per_step, self.coarseness) != (rays, coarseness)
 
-    def _look(self, step: int, samples_per_ray: float) -> float:
+    def _look(self, step: int, samples_per_ray: float) -> None:
+        if self.on_progress is None:
+            return
         self.photos.inform(self.judge)
         psnr = self.judge.psnr(self.model, self.photos.exposing)
         self.model.train()
-        if self.on_progress:
-            worked = self.clock.worked
-            left, seconds = seconds_left(self.config, step, worked), worked + self.clock.seconds
-            speed = self.rays_done / seconds
-            self.on_progress(FitProgress(step, self.config.steps, psnr, speed, samples_per_ray, seconds, left))
-        return psnr
+        worked = self.clock.worked
+        left, seconds = seconds_left(self.config, step, worked), worked + self.clock.seconds
+        speed = self.rays_done / seconds
+        self.on_progress(FitProgress(step, self.config.steps, psnr, speed, samples_per_ray, seconds, left))

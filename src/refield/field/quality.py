@@ -63,8 +63,6 @@ def sized(config: FitConfig, frames: Sequence[Frame], quality: Quality) -> FitCo
     return replace(
         config,
         steps=steps,
-        # half of the fit, as usual: while the learning rate is high, looks go up and down by more than they gain
-        patience=max(config.patience, steps // (2 * config.check_every)),
         max_seconds=config.max_seconds or effort.seconds,
         samples=samples,
         decay=(_DECAY if large else 0.0) if config.decay is None else config.decay,

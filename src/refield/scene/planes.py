@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
 
 Array = NDArray[Any]
+EXACT = 0.7  # of what cameras resolve; surfaces that are to be one plane keep to it
 _FEWEST = 50  # points
 _PART = 0.12  # of all points that a plane holds at least
 _FEW = 0.03  # of all points that may lie where they could not be seen, if it were one
@@ -47,8 +48,9 @@ class Plane:
 
 
 def rough_planes(points: Array, cameras: Array, resolved: float) -> list[Plane]:
-    """`support_planes` of points that are exact to ``resolved`` (world units), or up to four times less exact."""
-    return _roughly(lambda tol: support_planes(points, cameras, tol), resolved)
+    """`support_planes` of points that are exact to ``resolved`` (world units), or up to four times less exact: the
+    planes of the least tolerance at which there are any; a fitted surface may be uneven."""
+    return next(filter(None, (support_planes(points, cameras, rough * EXACT * resolved) for rough in (1, 2, 4))), [])
 
 
 def support_planes(points: Array, cameras: Array, tol: float) -> list[Plane]:
@@ -58,16 +60,6 @@ def support_planes(points: Array, cameras: Array, tol: float) -> list[Plane]:
         return (plane.height(points) < -2.5 * tol).mean() < _FEW and bool((plane.height(cameras) > 0).all())
 
     return _planes(points, cameras, tol, possible)
-
-
-def rough_tops(points: Array, eyes: Array, still: NDArray[np.bool_], resolved: float) -> list[Plane]:
-    """`support_tops` of points that are exact to ``resolved`` (world units), or up to four times less exact."""
-    return _roughly(lambda tol: support_tops(points, eyes, still, tol), resolved)
-
-
-def _roughly(planes_at: Callable[[float], list[Plane]], resolved: float) -> list[Plane]:
-    """The planes of the least tolerance at which there are any; a fitted surface may be uneven."""
-    return next(filter(None, (planes_at(rough * 0.7 * resolved) for rough in (1, 2, 4))), [])
 
 
 def support_tops(points: Array, eyes: Array, still: NDArray[np.bool_], tol: float) -> list[Plane]:

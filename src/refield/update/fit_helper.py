@@ -16,7 +16,7 @@ from refield.field.kernels.reference import Aim, Batch, Fixed, Unwanted
 from refield.field.radiance import HashField
 from refield.field.render import CHUNK
 from refield.field.sampling import STOP
-from refield.field.schedule import at_plateau, rate_factor
+from refield.field.schedule import rate_factor
 from refield.field.volrend import Samples, accumulate_rgb
 from refield.scene.capture import Rays
 from refield.update.composite import UpdatedField
@@ -62,6 +62,12 @@ class HelperConfig:
     """looks without ``least_gain`` after which training stops"""
     least_gain: float = 0.03
     """dB"""
+
+
+def at_plateau(looks: list[float], config: HelperConfig) -> bool:
+    """Whether the last looks at the held-out pixels, dB, have gained nothing."""
+    n = config.patience
+    return len(looks) > n and max(looks[-n:]) < max(looks[:-n]) + config.least_gain
 
 
 @dataclass(frozen=True)
