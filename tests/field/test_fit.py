@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -258,6 +259,28 @@ def test_a_rig_that_looks_one_way_is_placed_by_its_points(capture: Capture) -> N
     points = torch.rand(200, 3, generator=g) * 0.4 + torch.tensor([0.0, 0.0, 1.8])
     space = place_contraction(Capture(tuple(frames), points))
     assert abs(float(space.centre[2]) - 2.0) < 0.3 and 0.8 < space.radius < 1.6
+
+
+@pytest.mark.parametrize(
+    "looks, verdicts",
+    [
+        ([(100, 22.4, 26.1), (500, 32.2, 27.6), (750, 33.2, 26.5)], [False, False, True]),  # fell late
+        ([(100, 23.3, 26.8), (500, 32.4, 32.7), (750, 33.6, 33.4)], [False, False, False]),
+        ([(100, 22.0, 20.0), (500, 30.0, 20.3)], [False, True]),
+        ([(100, 22.0, 20.0), (499, 30.0, 20.3), (1000, 33.0, 20.0)], [False, False, False]),  # not asked then
+    ],
+)
+def test_what_is_learnt_by_heart_is_noticed_at_two_steps(
+    looks: list[tuple[int, float, float]], verdicts: list[bool]
+) -> None:
+    """Steps done, PSNR of the photos that teach and of those left out; the first two are two seeds of one world."""
+    fit: Any = SimpleNamespace(first=None, model=SimpleNamespace(train=lambda: None))
+    fit.photos, found = SimpleNamespace(exposing=False), []
+    for step, taught, left_out in looks:
+        fit.steps_done, fit.loss = step, 10 ** (-taught / 10)
+        fit.judge = SimpleNamespace(psnr=lambda *_, seen=left_out: seen)
+        found.append(_Fit._stuck(fit))
+    assert found == verdicts
 
 
 def test_learning_rate_is_held_then_falls() -> None:
