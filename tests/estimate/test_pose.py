@@ -16,7 +16,7 @@ from refield.estimate.conclude import _shown_in
 from refield.estimate.detail import detail_of, looking_alike
 from refield.estimate.explain import explained_before
 from refield.estimate.faces import changed_parts
-from refield.estimate.fit import is_sunk, trimmed
+from refield.estimate.fit import is_sunk, left_by, trimmed
 from refield.estimate.ground import AssociateConfig
 from refield.estimate.hull import HullConfig
 from refield.estimate.kept import Kept
@@ -29,7 +29,6 @@ from refield.estimate.past import changed_share, gone_score, look_past, silhouet
 from refield.estimate.pose_change import COARSEST, FINER, SIDE, RefineConfig, refine, residuals
 from refield.estimate.register import RegisterConfig, Target, register, super_fibonacci, turns_about
 from refield.estimate.rotations import best_rotations, may_be_turned
-from refield.estimate.settle import looks_gone
 from refield.field.render import render_camera
 from refield.field.source import Known
 from refield.scene.camera import Camera
@@ -111,8 +110,8 @@ def test_looking_past_it_heeds_how_near_to_a_surface_is_on_it(stage):
     for surface in (HullConfig().surface, 1e4):
         carving, memory = HullConfig(surface=surface), stage.scene.errors.memory
         past = look_past(BEFORE, stage.scene.changed, memory, [stage.old], (stage.scene.config.detect, carving))
-        ground = SimpleNamespace(past=lambda *_, past=past: past, believe=AssociateConfig())
-        told[surface] = looks_gone(ground, stage.scene.changed, stage.old)
+        ground = SimpleNamespace(believe=AssociateConfig())
+        told[surface] = left_by(ground, past, stage.old) is not None
     assert list(told.values()) == [True, False]
 
 
@@ -184,6 +183,13 @@ def test_all_rotations_about_a_place_are_asked_what_they_explain(stage):
     assert error(best.new_from_old)[0] < 1.5 and best.explained > as_it_is.explained + 0.1
     later = SimpleNamespace(**(vars(ground) | {"photographed": []}))
     assert not may_be_turned(later, stage.old, stage.past, wrongly)
+
+
+def test_an_object_is_rotated_in_every_way_at_a_place(stage):
+    ground, place = turning(stage), transform(TRUE, torch.from_numpy(stage.old.centre).double()).numpy()
+    found = rotations.rotated_at(ground, Sight(BEFORE, stage.old, stage.past, [stage.old]), place + 0.01)
+    best = max((change for _, change in found), key=lambda change: change.explained)
+    assert error(best.new_from_old)[0] < 1.5 and error(best.new_from_old)[1] < 0.01
 
 
 @pytest.mark.parametrize(("degrees", "most"), [(-17, 1), (-14, 1), (14, 1), (18, 3)])

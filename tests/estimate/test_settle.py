@@ -2,15 +2,19 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from refield.estimate import fit, recipe, rotations, settle
+from refield.estimate.detect import difference
+from refield.estimate.faces import Part, Parts
 from refield.estimate.lattice import Body, Lattice, grown, some_of
 from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of
+from refield.estimate.models import Models
 from refield.estimate.outline import as_one, restricted
 from refield.scene.pose import angle_between, transform
 from refield.scene.srgb import to_linear, to_srgb
@@ -183,6 +187,23 @@ def test_what_only_darkens_all_that_is_behind_it_is_no_newcomer(estimated):
     assert settle.newcomers(ground, shaded, list(olds)) == []
 
 
+def test_what_stands_in_a_shadow_larger_than_itself_is_found(estimated):
+    """Most of what changed there is light, and no photo contradicts that it is all one."""
+    ground, olds, changed, _ = estimated
+    views, body = came_to(ground, olds, changed)
+    shaded = []
+    for p in views:
+        thing = settle.shadow_of(p.view, body) & p.changed.mask
+        shade = pixels.dilate(thing, 12)
+        dark = np.where((shade & ~thing)[..., None], to_srgb(0.5 * to_linear(p.rgb)), p.view.photo).astype(np.float32)
+        view = replace(p.view, photo=dark)
+        off = difference(view, p.rgb, ground.detect)
+        shaded.append(replace(p, changed=replace(p.changed, view=view, mask=p.changed.mask | shade), difference=off))
+    (found,) = settle.newcomers(ground, shaded, list(olds))
+    assert body.lattice.holds(grown(body.voxels, 2), found.places).mean() > 0.9
+    assert found.volume > 0.3 * body.volume
+
+
 @pytest.mark.parametrize("everywhere", [True, False])
 def test_dappled_light_is_what_every_photo_shows_on_the_same_surface(everywhere, estimated):
     """However uneven it is; what each photo shows elsewhere stands before the surface."""
@@ -210,14 +231,18 @@ def test_what_moved_by_less_than_can_be_seen_hides_no_newcomer(estimated, monkey
     assert once.moved == {} and once.touched == () and not any(p.was.any() for p in once.views)
 
 
-def test_what_was_missed_at_first_is_found_among_what_arrived(estimated, monkeypatch):
-    """Told as one that left and one that arrived, an object is looked for again where that is."""
+@pytest.mark.parametrize("without", ["places_among", "rotated_at"])
+def test_what_was_missed_at_first_is_found_among_what_arrived(estimated, monkeypatch, without):
+    """Told as one that left and one that arrived, an object is looked for again where that is: as its surface's colours
+    fit, or rotated in every way."""
     ground, olds, changed, _ = estimated
     monkeypatch.setattr(settle, "place_all", lambda _g, olds, *_: ({}, dict(olds[1])))
-    with monkeypatch.context() as without:
-        without.setattr(settle, "places_among", lambda *_: [])
+    with monkeypatch.context() as neither:
+        for name in ("places_among", "rotated_at"):
+            neither.setattr(settle, name, lambda *_: [])
         missed = settle.Search(ground, changed).settle(olds)
     assert missed.removed and missed.arrived and not missed.moved
+    monkeypatch.setattr(settle, without, lambda *_: [])
     found = settle.Search(ground, changed).settle(olds)
     ((_, change),) = found.moved.items()
     assert float(angle_between(change.new_from_old, AWAY)) < 1.5 and not found.removed and not found.arrived
@@ -362,6 +387,23 @@ def test_an_object_is_put_where_its_thickest_part_fits_among_much_that_arrived(e
     assert any((wanted > 0).any() for wanted in target.wanted)
 
 
+def test_what_turned_where_it_stands_is_asked_for_though_it_does_not_look_gone(
+    estimated, capture, tmp_path, monkeypatch
+):
+    """It looks like what a newcomer hides; the likelihood says what became of it."""
+    ground, (old,), _, _ = estimated
+    frames = new_photos(BoxWorld((CRATE.moved(turn(CENTRE, 45, (0, 0, 0))),)), tmp_path)
+    scene = recipe._detected(capture, BEFORE, frames, CONFIG, Models())
+    assert fit.left_by(ground, settle.without(ground, scene.changed, [old]), old) is None
+    monkeypatch.setattr(recipe, "_were_there", lambda *_: [old])
+    monkeypatch.setattr(recipe, "unexplained", lambda *_: False)
+    body = Body(old.lattice, old.voxels)
+    parts = Parts([], [Part(SimpleNamespace(lattice=body.lattice), body.voxels, body.voxels)])
+    assert recipe._overlooked(scene, ground, Settled(), parts, []) == [old]
+    still = replace(scene, changed=tuple(replace(c, mask=np.zeros_like(c.mask)) for c in scene.changed))
+    assert recipe._overlooked(still, ground, Settled(), parts, []) == []
+
+
 def test_settling_more_keeps_what_was_settled(estimated):
     ground, olds, changed, found = estimated
     search = settle.Search(ground, changed)
@@ -402,6 +444,7 @@ def test_an_object_that_explains_nothing_is_taken_back(capture, tmp_path, monkey
     monkeypatch.setattr(settle, "place_all", astray)
     monkeypatch.setattr(settle, "slid", lambda *_: None)
     monkeypatch.setattr(settle, "places_among", lambda *_: [])
+    monkeypatch.setattr(settle, "rotated_at", lambda *_: [])
     change, _ = settled(capture, tmp_path, monkeypatch)
     assert sorted(o.kind for o in change.objects) == (["moved"] if known else ["added", "removed"])
     assert not known or float(angle_between(change.objects[0].new_from_old, AWAY)) < 1.5

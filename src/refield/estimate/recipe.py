@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from refield.estimate import detect, hull, light, look
-from refield.estimate.associate import is_crumb
+from refield.estimate.associate import is_crumb, may_have_changed
 from refield.estimate.conclude import Told, concluded, disagreeing
 from refield.estimate.detect import Changed, DetectConfig, Errors, Mask
 from refield.estimate.faces import Part, Parts, changed_parts
@@ -30,7 +30,7 @@ from refield.estimate.paper.route import estimate_change_paper
 from refield.estimate.place import PlaceConfig, place
 from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
-from refield.estimate.settle import Search, is_piece, looks_gone, unexplained
+from refield.estimate.settle import Search, is_piece, unexplained
 from refield.field.radiance import Field, check_field
 from refield.field.source import Known
 from refield.scene.capture import Capture, Frame, check_capture, check_frames
@@ -315,7 +315,7 @@ def _overlooked(scene: _Scene, ground: Ground, settled: Settled, parts: Parts, k
         if needed or part.body.volume >= least:
             found = _were_there(scene, [replace(part, where=part.voxels)], [*known, *more])
             found = [o for o in found if o.remembered or not is_crumb(ground, scene.changed, o)]
-            more += [old for old in found if needed or looks_gone(ground, scene.changed, old)]
+            more += [old for old in found if needed or may_have_changed(ground, scene.changed, old)]
     return more
 
 

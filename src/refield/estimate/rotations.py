@@ -19,6 +19,7 @@ from refield.estimate.explain import FEWEST, explained
 from refield.estimate.fit import SHIFTS, believed, detail_for, finest, finished, shown_right
 from refield.estimate.ground import Ground
 from refield.estimate.layers import Layers, Sight, layers_at
+from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.past import Past
 from refield.estimate.pose_change import FINER, SIDE, PoseChange, refine, shared_out
@@ -47,6 +48,13 @@ def best_rotations(ground: Ground, sight: Sight, change: PoseChange) -> list[tup
         old, best = max(found, key=lambda one: one[1].explained)
         found.append((old, _climbed(ground, sight, old, best.new_from_old) or best))
     return [as_it_is, *(one for one in found if believed(ground, one[0], sight.past, one[1]))]
+
+
+def rotated_at(ground: Ground, sight: Sight, place: Array) -> list[tuple[Old, PoseChange]]:
+    """The few rotations that explain most of an object with its middle at a place (3,), refined to the end; whether it
+    is there is not said."""
+    shift = torch.from_numpy(place - sight.old.centre).double()
+    return finest(ground, sight, _starts(ground, sight, rigid(torch.eye(3, dtype=torch.float64), shift)))
 
 
 def _starts(ground: Ground, sight: Sight, pose: Tensor) -> list[Tensor]:

@@ -41,14 +41,16 @@ from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import as_one, standing
-from refield.estimate.past import Past, changed_share
+from refield.estimate.past import Past
 from refield.estimate.pose_change import FINER, PoseChange, refine
-from refield.estimate.rotations import best_rotations, may_be_turned
+from refield.estimate.rotations import best_rotations, may_be_turned, rotated_at
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
 _Tries = Callable[[Settled], Iterator[Settled]]
 _Which = tuple[str, int, int]
+_SAME = 0.25
+"""of an object's radius; places that are nearer to each other are asked for its rotation once"""
 _OTHERS = ("elsewhere", "again", "stayed")
 """what says of an object something else, not the same more exactly"""
 
@@ -69,6 +71,8 @@ class Search:
     """how an object may have slid"""
     again: Kept[list[Fit]] = field(default_factory=Kept)
     """where what left may be among what arrived"""
+    rotated: Kept[list[tuple[Array, list[tuple[Old, PoseChange]]]]] = field(default_factory=Kept)
+    """how what left may be rotated, place by place"""
     hypotheses: Kept[Settled] = field(default_factory=lambda: Kept(16))
     """by what was, what was touched and where it is"""
     outlined: Kept[Old | None] = field(default_factory=Kept)
@@ -296,6 +300,19 @@ class Search:
         )
         for fit in found:
             yield self._with(best, k, fit.old, fit.change)
+        sight = Sight(self.ground.field, old, views, gone)
+        for body in best.arrived:
+            for one, change in self._rotated(sight, body.places.mean(0)):
+                yield self._with(best, k, one, change)
+
+    def _rotated(self, sight: Sight, place: Array) -> list[tuple[Old, PoseChange]]:
+        """How an object may be rotated at a place; asked once of places that are hardly apart."""
+        asked = self.rotated.get((sight.old,), list)
+        for near, found in asked:
+            if np.linalg.norm(near - place) < _SAME * sight.old.radius:
+                return found
+        asked.append((place, rotated_at(self.ground, sight, place)))
+        return asked[-1][1]
 
     def _stayed(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object less that moved, as it was outlined at first, or as all that changed with it; or as if it had
@@ -404,12 +421,6 @@ def unexplained(ground: Ground, settled: Settled, asked: Body) -> bool:
         shown += int(here.sum())
         left += int((here & p.changed.mask & ~p.explained & ~pixels.dilate(came, 2)).sum())
     return left > ground.believe.touched * shown
-
-
-def looks_gone(ground: Ground, changed: Sequence[Changed], old: Old) -> bool:
-    """Whether an object's pixels changed and show what was behind it."""
-    past = without(ground, changed, [old])
-    return changed_share(past, old) >= ground.believe.touched and left_by(ground, past, old) is not None
 
 
 def is_piece(old: Old, others: Sequence[Old]) -> bool:
