@@ -48,7 +48,8 @@ def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list
     out, open_ = list[Body](), [p.open & p.changed.certain for p in past]
     some = arrivals(ground, past, olds)
     some = [body for body in some if any(_speaks(ground, s & o) for s, o in zip(shadows_of(past, body), open_))]
-    left = [(b, shadows_of(past, b)) for body in some for b in _thick(ground, _finer(ground, body, past, olds))]
+    thick = [part for body in some for part in _thick(ground, _finer(ground, body, past, olds))]
+    left = [(part, shadows_of(past, part)) for part in thick]
     light = cache(partial(_lit, ground, past))
     while left:
         left.sort(key=lambda one: -sum(int((here & o).sum()) for here, o in zip(one[1], open_)))
@@ -58,7 +59,7 @@ def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list
         if len(shares) < min(2, len(past)) or float(np.median(shares)) <= ground.believe.arrived:
             continue
         if _only_light(ground, body, past, shadows, light()):
-            left += [(b, shadows_of(past, b)) for b in _without_light(ground, body, past, light())]
+            left += [(part, shadows_of(past, part)) for part in _without_light(ground, body, past, light())]
             continue
         out.append(body)
         open_ = [o & ~pixels.dilate(here, 1) for o, here in zip(open_, shadows)]
@@ -197,8 +198,7 @@ def _without_light(ground: Ground, body: Body, past: Sequence[Past], light: Sequ
     dark = [pixels.dilate(pixels.erode(p.open & (one.alike | one.even), 1), 1) for p, one in zip(past, light)]
     lit = [replace(p, changed=replace(p.changed, mask=p.changed.mask & ~d)) for p, d in zip(past, dark)]
     parts = _thick(ground, _new(body, lit, ground.carving, 0))
-    voxels = np.logical_or.reduce([part.voxels for part in parts] or [np.zeros_like(body.voxels)])
-    return [replace(body, voxels=voxels)] if 0 < 2 * voxels.sum() < body.voxels.sum() else []
+    return [part for part in parts if part.voxels.sum() < body.voxels.sum()]
 
 
 def _count(some: Sequence[Mask], others: Sequence[Mask]) -> int:

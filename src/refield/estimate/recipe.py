@@ -303,10 +303,10 @@ def _were_there(scene: _Scene, parts: Sequence[Part], known: Sequence[Old] = ())
 
 
 def _overlooked(scene: _Scene, ground: Ground, settled: Settled, parts: Parts, known: list[Old]) -> list[Old]:
-    """Objects that look like what a newcomer hides, since they go on outside of the changed pixels, and yet left.
+    """Objects that look like what a newcomer hides, since they go on outside of the changed pixels, and yet changed.
 
-    What they would explain is explained by nothing else, or the photos show what was behind them. Crumbs are none,
-    unless an earlier visit knows them.
+    What they would explain is explained by nothing else, or most of their pixels changed: what turned where it stands
+    does not look gone. Crumbs are none, unless an earlier visit knows them.
     """
     least = 0.15 * max(p.body.volume for p in (*parts.things, *parts.others))
     more: list[Old] = []

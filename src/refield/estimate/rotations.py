@@ -1,4 +1,5 @@
-"""The rotation of an object that was found, out of all there are: of one that is explained less than the field shows.
+"""The rotation of an object at a place, out of all there are: of one that was found and is explained less than the
+field shows, and of one that left where something arrived.
 
 Registration compares the colours of surface points, which of a thing some pixels wide tell the place and hardly the
 rotation. What its composite explains of the photos rises towards the true one on all sides, yet descent follows that
@@ -51,7 +52,7 @@ def best_rotations(ground: Ground, sight: Sight, change: PoseChange) -> list[tup
 
 
 def rotated_at(ground: Ground, sight: Sight, place: Array) -> list[tuple[Old, PoseChange]]:
-    """The few rotations that explain most of an object with its middle at a place (3,), refined to the end; whether it
+    """The few rotations of an object with its middle at a place (3,) that explain most, refined to the end; whether it
     is there is not said."""
     shift = torch.from_numpy(place - sight.old.centre).double()
     return finest(ground, sight, _starts(ground, sight, rigid(torch.eye(3, dtype=torch.float64), shift)))
@@ -64,6 +65,8 @@ def _starts(ground: Ground, sight: Sight, pose: Tensor) -> list[Tensor]:
     poses = [rigid(r, place - r @ centre) for r in torch.from_numpy(super_fibonacci(ground.search.rotations))]
     few = ground.believe.refined
     by_field = layers_at(sight, pose, shared_out(ground.fine.rays[0], len(sight.past)), turning=True)
+    if not by_field.crops:  # no photo shows the place
+        return []
     by_points = replace(by_field, by_points=True)
     for ready, kept in ((by_points, max(few, round(_LIKELY * len(poses)))), (by_field, few)):
         parts = [_part(ready, p) for p in poses]

@@ -73,7 +73,7 @@ class Search:
     """where what left may be among what arrived"""
     rotated: Kept[list[tuple[Array, list[tuple[Old, PoseChange]]]]] = field(default_factory=Kept)
     """how what left may be rotated, place by place"""
-    hypotheses: Kept[Settled] = field(default_factory=lambda: Kept(16))
+    hypotheses: Kept[Settled] = field(default_factory=lambda: Kept(32))
     """by what was, what was touched and where it is"""
     outlined: Kept[Old | None] = field(default_factory=Kept)
     """what went along with an object, by its motion"""
@@ -291,7 +291,10 @@ class Search:
                     yield self._with(best, k, old, change, rest)
 
     def _again(self, best: Settled, k: int) -> Iterator[Settled]:
-        """With an object that left where something arrived: it was looked for before all was known that hides it."""
+        """With an object that left where something arrived, as its surface's colours fit or in any rotation: it was
+        looked for before all was known that hides it."""
+        if k not in best.removed:  # no longer, as in `_joined`
+            return
         old = best.olds[k]
         gone, views = self._without(best, k, old)
         found = self.again.get(
@@ -302,8 +305,10 @@ class Search:
             yield self._with(best, k, fit.old, fit.change)
         sight = Sight(self.ground.field, old, views, gone)
         for body in best.arrived:
-            for one, change in self._rotated(sight, body.places.mean(0)):
-                yield self._with(best, k, one, change)
+            for one, rotated in self._rotated(sight, body.places.mean(0)):
+                change = self._refined(best, k, one, rotated)  # asked of other photos, and of pixels alone
+                if change is not None:
+                    yield self._with(best, k, one, change)
 
     def _rotated(self, sight: Sight, place: Array) -> list[tuple[Old, PoseChange]]:
         """How an object may be rotated at a place; asked once of places that are hardly apart."""
