@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from refield.estimate import fit, recipe, rotations, settle
-from refield.estimate.detect import difference
 from refield.estimate.faces import Part, Parts
 from refield.estimate.lattice import Body, Lattice, grown, some_of
 from refield.estimate.layers import Sight
@@ -185,23 +184,6 @@ def test_what_only_darkens_all_that_is_behind_it_is_no_newcomer(estimated):
         dark = np.where(here[..., None], to_srgb(0.5 * to_linear(p.rgb)), p.view.photo).astype(np.float32)
         shaded.append(replace(p, changed=replace(p.changed, view=replace(p.view, photo=dark))))
     assert settle.newcomers(ground, shaded, list(olds)) == []
-
-
-def test_what_stands_in_a_shadow_larger_than_itself_is_found(estimated):
-    """Most of what changed there is light, and no photo contradicts that it is all one."""
-    ground, olds, changed, _ = estimated
-    views, body = came_to(ground, olds, changed)
-    shaded = []
-    for p in views:
-        thing = settle.shadow_of(p.view, body) & p.changed.mask
-        shade = pixels.dilate(thing, 12)
-        dark = np.where((shade & ~thing)[..., None], to_srgb(0.5 * to_linear(p.rgb)), p.view.photo).astype(np.float32)
-        view = replace(p.view, photo=dark)
-        off = difference(view, p.rgb, ground.detect)
-        shaded.append(replace(p, changed=replace(p.changed, view=view, mask=p.changed.mask | shade), difference=off))
-    (found,) = settle.newcomers(ground, shaded, list(olds))
-    assert body.lattice.holds(grown(body.voxels, 2), found.places).mean() > 0.9
-    assert found.volume > 0.3 * body.volume
 
 
 @pytest.mark.parametrize("everywhere", [True, False])

@@ -48,21 +48,17 @@ def newcomers(ground: Ground, past: Sequence[Past], olds: Sequence[Old]) -> list
     out, open_ = list[Body](), [p.open & p.changed.certain for p in past]
     some = arrivals(ground, past, olds)
     some = [body for body in some if any(_speaks(ground, s & o) for s, o in zip(shadows_of(past, body), open_))]
-    thick = [part for body in some for part in _thick(ground, _finer(ground, body, past, olds))]
-    left = [(part, shadows_of(past, part)) for part in thick]
+    left = [(b, shadows_of(past, b)) for body in some for b in _thick(ground, _finer(ground, body, past, olds))]
     light = cache(partial(_lit, ground, past))
     while left:
         left.sort(key=lambda one: -sum(int((here & o).sum()) for here, o in zip(one[1], open_)))
         body, shadows = left.pop(0)
         seen = [(here, o, p.known) for here, o, p in zip(shadows, open_, past) if _speaks(ground, here & o)]
         shares = [float((here & o).sum() / (here & known).sum()) for here, o, known in seen]
-        if len(shares) < min(2, len(past)) or float(np.median(shares)) <= ground.believe.arrived:
-            continue
-        if _only_light(ground, body, past, shadows, light()):
-            left += [(part, shadows_of(past, part)) for part in _without_light(ground, body, past, light())]
-            continue
-        out.append(body)
-        open_ = [o & ~pixels.dilate(here, 1) for o, here in zip(open_, shadows)]
+        enough = len(shares) >= min(2, len(past)) and float(np.median(shares)) > ground.believe.arrived
+        if enough and not _only_light(ground, body, past, shadows, light()):
+            out.append(body)
+            open_ = [o & ~pixels.dilate(here, 1) for o, here in zip(open_, shadows)]
     return out
 
 
@@ -191,14 +187,6 @@ def _only_light(
     # about a quarter of the smallest thing's pixels in these photos: by fewer the two do not differ
     fewest = (1 - CAME) * price(shadows, ground.believe.smallest)
     return _count(both, alike) > _count(both, shown) - fewest
-
-
-def _without_light(ground: Ground, body: Body, past: Sequence[Past], light: Sequence[_Lit]) -> list[Body]:
-    """What is left of a would-be newcomer that mostly is light: a thing may stand in its own shadow."""
-    dark = [pixels.dilate(pixels.erode(p.open & (one.alike | one.even), 1), 1) for p, one in zip(past, light)]
-    lit = [replace(p, changed=replace(p.changed, mask=p.changed.mask & ~d)) for p, d in zip(past, dark)]
-    parts = _thick(ground, _new(body, lit, ground.carving, 0))
-    return [part for part in parts if part.voxels.sum() < body.voxels.sum()]
 
 
 def _count(some: Sequence[Mask], others: Sequence[Mask]) -> int:
