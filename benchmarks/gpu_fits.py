@@ -12,14 +12,12 @@ from pathlib import Path
 import torch
 
 from benchmarks.record import Report, Row, forget_peaks, median, one_line, peak_memory
-from refield.field import fit_nerfacto, gpu_fit, graphed
+from refield.field import gpu_fit, graphed
 from refield.field.coverage import beside, knowable
 from refield.field.fit import FitConfig, FitProgress
-from refield.field.fit_nerfacto import NerfactoFitConfig
+from refield.field.fit_nerfacto import NerfactoFitConfig, fit_nerfacto
 from refield.field.gpu_fit import move
-from refield.field.graphed import DevicePixels
-from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig, looking_everywhere
-from refield.field.photo_model import PhotoModel
+from refield.field.nerfacto import NerfactoConfig, ProposalConfig
 from refield.field.photos import Photos
 from refield.field.placing import finest_for, place_contraction
 from refield.field.radiance import HashField, HashFieldConfig
@@ -78,7 +76,7 @@ def noting_captures(device: torch.device) -> Iterator[Captures]:
 def fit(model: HashField, capture: Capture, config: FitConfig, device: torch.device, looks: list[FitProgress]) -> None:
     """`fit_on_gpu`; on a CPU the same loop by the same kernels."""
     if device.type == "cuda":
-        gpu_fit.fit_on_gpu(model, capture, Photos.of(capture), config, looks.append)
+        gpu_fit.fit_on_gpu(model, capture, Photos.of(capture), config, (looks.append, None))
     else:
         usual = gpu_fit._SIZES, gpu_fit.EVERY
         gpu_fit._SIZES, gpu_fit.EVERY = [8], 4
@@ -163,23 +161,11 @@ def keep(model: HashField, folder: Path) -> None:
 
 
 def nerfacto(report: Report, capture: Capture, config: NerfactoFitConfig, device: torch.device) -> None:
-    """The NeRFacto shape on the same photos. `fit_nerfacto` knows no device: its loop is set up on one here."""
+    """The NeRFacto shape on the same photos."""
     forget_peaks(device)
     looks: list[FitProgress] = []
-    torch.manual_seed(config.seed)
-    with report.trial("the NeRFacto shape is not on a GPU yet"):
-        sampler = looking_everywhere(place_contraction(capture), config.field)
-        model = NerfactoField(config.field, sampler, config.seed)
-        fitting = fit_nerfacto._NerfactoFit(model, Photos.of(capture), config, looks.append)
-        move(model, device)  # type: ignore[arg-type]
-        bank = DevicePixels(fitting.photos.bank, device)  # type: ignore[arg-type]
-        with torch.device(device):
-            fitting.photos = PhotoModel(bank, model.sampler, config.photos)
-        fitting.judge.move(device)
-        fitting.adam = torch.optim.Adam(model.parameters(), lr=config.rate, eps=1e-15, fused=True)
-        fitting.began = time.perf_counter()
-        with torch.device(device):
-            fitting.run()
+    with report.trial("the NeRFacto shape"):
+        fit_nerfacto(capture, replace(config, device=device.type), looks.append)
     if looks:
         row = curve_row(looks, looks[-1]) | peak_memory(device)
         report.add(NERFACTO, {"asked for": f"{config.steps} steps or {config.max_seconds:.0f} s"} | row)

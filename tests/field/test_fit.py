@@ -140,18 +140,18 @@ def test_a_fit_that_leads_nowhere_begins_anew(capture: Capture, monkeypatch: pyt
     short = replace(TINY, steps=20, check_every=20, field=replace(TINY.field, levels=2, log2_table=8))
     other = fit_field(capture, replace(short, seed=short.seed + 1))
     asked: list[int] = []
-    monkeypatch.setattr(_Fit, "_stuck", lambda fit: asked.append(fit.steps_done) or (len(asked) == 5))
+    monkeypatch.setattr(_Fit, "_stuck", lambda fit, within: asked.append(fit.steps_done) or (len(asked) == 5))
     again = fit_field(capture, short)
     assert asked == [1, 2, 3, 4, 5, *range(1, 21)]
     assert all(torch.equal(a, b) for a, b in zip(again.parameters(), other.parameters()))
     with monkeypatch.context() as patch:
-        patch.setattr(_Fit, "_stuck", lambda fit: True)
+        patch.setattr(_Fit, "_stuck", lambda fit, within: True)
         told = iter([1.0, 3.0, 2.0, 0.0])
         patch.setattr(HeldOut, "psnr", lambda judge, model, exposed=False: next(told, 0.0))
         last = fit_field(capture, short)  # of four that were given up the best is fitted to its end
     assert all(torch.equal(a, b) for a, b in zip(last.parameters(), other.parameters()))
     asked.clear()
-    monkeypatch.setattr(_Fit, "_stuck", lambda fit: asked.append(fit.steps_done) is None)
+    monkeypatch.setattr(_Fit, "_stuck", lambda fit, within: asked.append(fit.steps_done) is None)
     monkeypatch.setattr("refield.field.fit._LATE", 0.0)
     fit_field(capture, short)
     assert asked == [*range(1, 21)]  # too late to begin anew: it goes on with what it has
@@ -279,7 +279,7 @@ def test_what_is_learnt_by_heart_is_noticed_at_two_steps(
     for step, taught, left_out in looks:
         fit.steps_done, fit.loss = step, 10 ** (-taught / 10)
         fit.judge = SimpleNamespace(psnr=lambda *_, seen=left_out: seen)
-        found.append(_Fit._stuck(fit))
+        found.append(_Fit._stuck(fit, 1))
     assert found == verdicts
 
 

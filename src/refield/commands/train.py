@@ -58,7 +58,7 @@ class Train:
     """photos without poses: how they are taken in, and how their poses are found"""
     architecture: Literal["hash", "nerfacto", "nerfacto-reduced"] = "hash"
     """of the field: hash, for a CPU; nerfacto, for long fits; or that one reduced. Hash fits in less than a minute;
-    reduced, NeRFacto trains on a CPU in minutes (and heeds the limit, seed and photos of ``nerfacto``)"""
+    reduced, NeRFacto trains on a CPU in minutes (and heeds device, limit, seed and photos of ``nerfacto``)"""
     route: Literal["paper", "paper-reduced"] | None = None
     """as refield update wants it with the same option. It is nerfacto, or that reduced; exposures are not sought"""
     fit: FitConfig = OPEN
@@ -94,8 +94,10 @@ def _config_of(options: Train) -> FitConfig | NerfactoFitConfig:
             long = replace(long, photos=replace(long.photos, exposures=False))
     if architecture == "hash":
         return options.fit
-    reduced = replace(REDUCED, max_seconds=long.max_seconds, seed=long.seed, photos=long.photos, size=long.size)
-    return long if architecture == "nerfacto" else reduced
+    if architecture == "nerfacto":
+        return long
+    reduced = replace(REDUCED, device=long.device, max_seconds=long.max_seconds, seed=long.seed)
+    return replace(reduced, photos=long.photos, size=long.size)
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ def train(
             memory.
     """
     Workspace.refuse_unless_free(task.work, overwrite=overwrite)
-    need_device(config.device if isinstance(config, FitConfig) else "cpu")
+    need_device(config.device)
     capture, landmarks = _loaded(task, clock)
     if quality is not None and isinstance(config, FitConfig):
         config = sized(config, capture.train, quality)

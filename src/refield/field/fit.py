@@ -18,7 +18,7 @@ from refield.field.kernels.reference import Aim
 from refield.field.occupancy import OccupancyTrainer
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
 from refield.field.photo_size import PhotoSizeConfig, as_read, at_full_size
-from refield.field.photos import UNCHANGED, Photos, Since
+from refield.field.photos import UNCHANGED, HeldOut, Photos, Since
 from refield.field.placing import COLOUR_IN, DIRECTED, around, new_field, opened, place_contraction, stand_outside
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.sampling import STOP
@@ -185,10 +185,13 @@ def fit_capture(
             torch.manual_seed(seed)
             model = new_field(capture, config, seed, core) if start is None else opened(start)
             try:
+                may_give_up = start is None and attempt < _TRIES - 1
                 if on_gpu:
-                    found = _fit_on_gpu(model, capture, photos, config, (on_progress, on_step), clock)
+                    from refield.field.gpu_fit import fit_on_gpu
+
+                    told, how = (on_progress, on_step), (may_give_up, goes_on)
+                    found = fit_on_gpu(model, capture, photos, config, told, clock, how)
                 else:
-                    may_give_up = start is None and attempt < _TRIES - 1
                     run = _Fit(model, photos, config, on_progress, on_step, clock, goes_on=goes_on)
                     run.run(may_give_up)
                     found = run.photos.told(capture, run.judge, model)
@@ -233,19 +236,6 @@ def _check_gpu(config: FitConfig, since: Since) -> None:
         raise InputError("device cuda", "draws all pixels alike, in colours that depend on the direction", "fit on cpu")
 
 
-def _fit_on_gpu(
-    model: HashField,
-    capture: Capture,
-    photos: Photos,
-    config: FitConfig,
-    told: tuple[ProgressCallback | None, StepCallback | None],
-    clock: Compiling,
-) -> Capture:
-    from refield.field.gpu_fit import fit_on_gpu
-
-    return fit_on_gpu(model, capture, photos, config, *told, clock)
-
-
 def need_device(device: str) -> None:
     """Raises InputError: it is not there."""
     if device == "cuda" and not torch.cuda.is_available():
@@ -257,7 +247,96 @@ def most_pixels(config: FitConfig) -> int | None:
     return None if config.photo_memory is None else max(int(config.photo_memory * 1e9 / 7), 1)
 
 
-class _Fit:
+class Fitting:
+    """What a fit's loop knows, on whatever device: how far it is, how it goes, whether it leads anywhere."""
+
+    def __init__(
+        self,
+        model: HashField,
+        parts: tuple[PhotoModel, HeldOut],
+        config: FitConfig,
+        told: tuple[ProgressCallback | None, StepCallback | None],
+        clock: Compiling | None = None,
+        goes_on: bool = False,
+    ) -> None:
+        """``parts``: what is learnt of the photos, and the judge; ``told``: who hears of looks and of steps."""
+        self.model, self.config, self.goes_on = model, config, goes_on
+        self.photos, self.judge = parts
+        self.on_progress, self.on_step = told
+        self.clock = clock or Compiling()
+        self.loss = math.nan
+        self.first: tuple[float, float] | None = None  # at the first step that `_stuck` asks
+        self.rays_done, self.steps_done = 0, 0
+
+    @property
+    def per_ray(self) -> float:
+        """Samples, of late."""
+        raise NotImplementedError
+
+    def steps(self, may_give_up: bool) -> None:
+        """Raises _StuckError early on if the fit leads nowhere and ``may_give_up``."""
+        raise NotImplementedError
+
+    def settle(self) -> None:
+        """The field as it is shown from now on."""
+        raise NotImplementedError
+
+    def run(self, may_give_up: bool = False) -> None:
+        """Raises _StuckError early on if the fit leads nowhere and ``may_give_up``."""
+        self.model.train()
+        try:
+            self.steps(may_give_up)
+        except NonFiniteError:
+            self.settle()
+            raise
+        self.settle()
+        self.look()
+
+    def progress(self, step: int) -> float:
+        return progress_of(self.config, step, self.clock.worked)
+
+    def rate_factor(self, progress: float) -> float:
+        """Of the learning rate; of a fit that goes on as in the second half of one that begins."""
+        return rate_factor((1 + progress) / 2 if self.goes_on else progress)
+
+    def may_expose(self, step: int, progress: float) -> None:
+        """Find out, when that is due, whether photos are exposed alike."""
+        if self.photos.may_expose(max(step / self.config.steps, progress / 2)):
+            self.photos.exposing = self.judge.tells_exposures(self.model)
+            self.model.train()
+
+    def give_up_if_stuck(self, within: int = 1) -> None:
+        """Raises _StuckError: the fit leads nowhere, and there is time to begin anew."""
+        if self._stuck(within) and self.progress(0) < _LATE:
+            raise _StuckError(self.judge.psnr(self.model, self.photos.exposing))
+
+    def _stuck(self, within: int) -> bool:
+        """Whether, by one of the later steps, the photos that teach have been learnt by heart; known only if some are
+        left out. Asked in every step, or in one of ``within``."""
+        if not any(0 <= self.steps_done - step < within for step in (_FIRST_STEP, *_LATER_STEPS)):
+            return False
+        now = -10 * math.log10(max(self.loss, 1e-12)), self.judge.psnr(self.model, self.photos.exposing)
+        self.model.train()
+        if self.first is None:
+            self.first = now
+            return False
+        taught, left_out = (b - a for a, b in zip(self.first, now))
+        return taught > 0 and left_out < _BY_HEART * taught
+
+    def look(self) -> None:
+        """Tell how the fit goes, where somebody listens."""
+        if self.on_progress is None:
+            return
+        self.photos.inform(self.judge)
+        psnr = self.judge.psnr(self.model, self.photos.exposing)
+        self.model.train()
+        worked, step = self.clock.worked, self.steps_done
+        left, seconds = seconds_left(self.config, step, worked), worked + self.clock.seconds
+        speed = self.rays_done / seconds
+        self.on_progress(FitProgress(step, self.config.steps, psnr, speed, self.per_ray, seconds, left))
+
+
+class _Fit(Fitting):
     """The state of one run of :func:`fit_field`."""
 
     def __init__(
@@ -270,12 +349,11 @@ class _Fit:
         clock: Compiling | None = None,
         goes_on: bool = False,
     ) -> None:
-        self.goes_on = goes_on
-        self.model, self.config, self.on_progress, self.on_step = model, config, on_progress, on_step
-        self.taught, self.pixels, self.judge = photos, photos.bank(), photos.judge()
+        self.taught, self.pixels = photos, photos.bank()
+        learnt = PhotoModel(self.pixels, model.sampler, config.photos)
+        super().__init__(model, (learnt, photos.judge()), config, (on_progress, on_step), clock, goes_on)
         brightness = self.pixels.brightness
         self.distortion = config.distortion * brightness**2  # errors of colour are as much less
-        self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
         self.adam = TableAdam(model, config.decay or 0.0, networks=brightness)
         if not config.directions:
             self.adam.parameters[COLOUR_IN].detach()[:, -DIRECTED:] = 0
@@ -286,62 +364,33 @@ class _Fit:
         model.looking_where(self.occupancy.allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.rays_per_step = 512
         self.samples_per_ray = config.samples / 512
-        self.clock = clock or Compiling()
-        self.loss = math.nan
-        self.first: tuple[float, float] | None = None  # at the first step that `_stuck` asks
-        self.rays_done, self.steps_done = 0, 0
         self.finest_step, self.coarseness = model.sampler.step, 1.0
         self._set_coarseness(COARSEST)
 
-    def run(self, may_give_up: bool = False) -> None:
-        """Raises _StuckError early on if the fit leads nowhere and ``may_give_up``."""
-        self.model.train()
-        try:
-            self._steps(may_give_up)
-        except NonFiniteError:
-            self._settle()
-            raise
-        self._settle()
-        self._look(self.steps_done)
+    @property
+    def per_ray(self) -> float:
+        return self.samples_per_ray
 
-    def _settle(self) -> None:
+    def settle(self) -> None:
         self.occupancy.settle(self.pixels)
         self.model.sampler = self.model.sampler.for_pictures()
 
-    def _steps(self, may_give_up: bool) -> None:
+    def steps(self, may_give_up: bool) -> None:
         for step in range(self.config.steps):
-            progress = self._progress(step)
+            progress = self.progress(step)
             if progress >= 1:
                 break
             self._step(step, progress)
             self.steps_done = step + 1
             if self.on_step:
                 self.on_step(step + 1, self.model)
-            if may_give_up and self._stuck() and self._progress(0) < _LATE:
-                raise _StuckError(self.judge.psnr(self.model, self.photos.exposing))
+            if may_give_up:
+                self.give_up_if_stuck()
             if (step + 1) % self.config.check_every == 0:
-                self._look(step + 1)
-
-    def _progress(self, step: int) -> float:
-        return progress_of(self.config, step, self.clock.worked)
-
-    def _stuck(self) -> bool:
-        """Whether, by one of the later steps, the photos that teach have been learnt by heart; known only if some are
-        left out."""
-        if self.steps_done not in (_FIRST_STEP, *_LATER_STEPS):
-            return False
-        now = -10 * math.log10(max(self.loss, 1e-12)), self.judge.psnr(self.model, self.photos.exposing)
-        self.model.train()
-        if self.steps_done == _FIRST_STEP or self.first is None:
-            self.first = now
-            return False
-        taught, left_out = (b - a for a, b in zip(self.first, now))
-        return taught > 0 and left_out < _BY_HEART * taught
+                self.look()
 
     def _step(self, step: int, progress: float) -> None:
-        if self.photos.may_expose(max(step / self.config.steps, progress / 2)):
-            self.photos.exposing = self.judge.tells_exposures(self.model)
-            self.model.train()
+        self.may_expose(step, progress)
         n = self.rays_per_step
         asked = self.photos.ask(self.taught.drawn(self.pixels, n), progress)
         model, sampler = self.model, self.model.sampler
@@ -350,7 +399,7 @@ class _Fit:
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
         where = (space, sampler.grid, sampler.lattice)
         done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, fine=sampler.fine)
-        rate = rate_factor((1 + progress) / 2 if self.goes_on else progress)
+        rate = self.rate_factor(progress)
         if not self.config.directions or (self.plain and self.photos.plain(progress)):
             self.adam.grads[COLOUR_IN][:, -DIRECTED:] = 0
         if self.adam.step(self.config.rate * rate, done.loss):
@@ -376,17 +425,6 @@ class _Fit:
         self.samples_per_ray *= self.coarseness / to
         self.coarseness = to
         self.model.sampler = replace(self.model.sampler, step=self.finest_step * to)
-
-    def _look(self, step: int) -> None:
-        if self.on_progress is None:
-            return
-        self.photos.inform(self.judge)
-        psnr = self.judge.psnr(self.model, self.photos.exposing)
-        self.model.train()
-        worked = self.clock.worked
-        left, seconds = seconds_left(self.config, step, worked), worked + self.clock.seconds
-        speed = self.rays_done / seconds
-        self.on_progress(FitProgress(step, self.config.steps, psnr, speed, self.samples_per_ray, seconds, left))
 
 
 def progress_of(config: FitConfig, step: int, seconds: float) -> float:

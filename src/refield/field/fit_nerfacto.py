@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
@@ -11,7 +13,7 @@ import torch
 from torch import Tensor
 
 from refield.field.descent import MOST_SKIPPED, NonFiniteError
-from refield.field.fit import FitProgress, Fitted, ProgressCallback
+from refield.field.fit import FitProgress, Fitted, ProgressCallback, need_device
 from refield.field.interlevel import interlevel_loss
 from refield.field.kernels.reference import Batch, Stepped, compared
 from refield.field.losses import colour_loss, distortion_loss, scale_gradients
@@ -19,6 +21,7 @@ from refield.field.nerfacto import NerfactoConfig, NerfactoField, ProposalConfig
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
 from refield.field.photo_size import PhotoSizeConfig, as_read, at_full_size
 from refield.field.photos import UNCHANGED, Photos, Since
+from refield.field.pixels import PixelBank, Pixels
 from refield.field.placing import DIRECTED, place_contraction
 from refield.field.proposal import Histogram, annealing
 from refield.field.sampling import OccupancySampler
@@ -63,6 +66,8 @@ class Schedule:
 class NerfactoFitConfig(Schedule):
     """Pre-training of the NeRFacto shape; the numbers are nerfstudio's, but for the background."""  # §10.1.1
 
+    device: Literal["cpu", "cuda"] = "cpu"
+    """where the fit runs. The field comes back to the CPU"""
     anneal_slope: float = 10.0
     """how steeply the proposals come to be trusted"""
     anneal_steps: int = 1000
@@ -110,20 +115,42 @@ def fit_nerfacto(
 
     Raises:
         ValueError: no frame to train on.
+        InputError: a GPU is wanted and there is none.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row; it holds the last good state.
     """
+    need_device(config.device)
     capture, since = as_read(capture, since, config.size)
     if not capture.train:
         raise ValueError("the capture has no frame to train on")
     torch.manual_seed(config.seed)
     model = NerfactoField(config.field, looking_everywhere(place_contraction(capture), config.field), config.seed)
-    fit = _NerfactoFit(model, Photos.of(capture, since), config, on_progress)
+    photos = Photos.of(capture, since)
+    with _on(config.device, model):
+        fit = _NerfactoFit(model, photos, config, on_progress)
+        try:
+            fit.run()
+        except NonFiniteError as error:
+            error.field, error.steps = _ready(model), fit.taken
+            raise
+        told = fit.photos.told(capture, fit.judge, cast(Any, model))
+        _ready(model)
+    return Fitted(model, at_full_size(told))
+
+
+@contextmanager
+def _on(device: str, model: NerfactoField) -> Iterator[None]:
+    """With the field on a device, where all is made that names none; it comes back to the CPU."""
+    if device == "cpu":
+        yield
+        return
+    from refield.field.gpu_fit import move
+
+    move(model, torch.device(device))
     try:
-        fit.run()
-    except NonFiniteError as error:
-        error.field, error.steps = _ready(model), fit.taken
-        raise
-    return Fitted(_ready(model), at_full_size(fit.photos.told(capture, fit.judge, cast(Any, model))))
+        with torch.device(device):
+            yield
+    finally:
+        move(model, torch.device("cpu"))
 
 
 def _ready(model: NerfactoField) -> NerfactoField:
@@ -137,6 +164,15 @@ def _ready(model: NerfactoField) -> NerfactoField:
     return model
 
 
+def _pixels(bank: PixelBank, device: str) -> Pixels:
+    """What they are drawn from, on a device."""
+    if device == "cpu":
+        return bank
+    from refield.field.graphed import DevicePixels
+
+    return DevicePixels(bank, torch.device(device))
+
+
 class _NerfactoFit:
     """The state of one run of :func:`fit_nerfacto`."""
 
@@ -144,8 +180,10 @@ class _NerfactoFit:
         self, model: NerfactoField, photos: Photos, config: NerfactoFitConfig, on_progress: ProgressCallback | None
     ) -> None:
         self.model, self.config, self.on_progress = model, config, on_progress
-        self.taught, self.judge = photos, photos.judge()
-        self.photos = PhotoModel(photos.bank(), model.sampler, config.photos)
+        with torch.device("cpu"):  # photos are read and posed there
+            bank, self.taught, self.judge = photos.bank(), photos, photos.judge()
+        self.photos = PhotoModel(_pixels(bank, config.device), model.sampler, config.photos)
+        self.judge.move(model.sampler.grid.device)
         if config.photos.exposures:  # see `PhotoModel.plain`
             with torch.no_grad():
                 model.colour_in[:, -DIRECTED:] = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -13,21 +14,19 @@ from refield.field.encoding import Contraction
 from refield.field.fit import (
     COARSEST,
     FitConfig,
-    FitProgress,
+    Fitting,
     ProgressCallback,
     StepCallback,
-    progress_of,
-    seconds_left,
 )
 from refield.field.graphed import Descent, DevicePixels, GraphedStep
 from refield.field.kernels.reference import Aim
+from refield.field.nerfacto import NerfactoField
 from refield.field.occupancy import DECAY, EVERY, OccupancyTrainer
 from refield.field.photo_model import PhotoModel
 from refield.field.photos import Photos
 from refield.field.placing import COLOUR_IN, DIRECTED, stand_outside
 from refield.field.radiance import HashField
 from refield.field.sampling import STOP
-from refield.field.schedule import rate_factor
 from refield.scene.capture import Capture
 
 _BATCH = 32  # times the samples of a step on a CPU: fewer would leave most of the chip idle
@@ -41,17 +40,19 @@ def fit_on_gpu(
     capture: Capture,
     photos: Photos,
     config: FitConfig,
-    on_progress: ProgressCallback | None = None,
-    on_step: StepCallback | None = None,
+    told: tuple[ProgressCallback | None, StepCallback | None] = (None, None),
     clock: Compiling | None = None,
+    how: tuple[bool, bool] = (False, False),
 ) -> Capture:
     """Fit a field to photos on the current CUDA device; the model comes back to where it was. Returns the capture with
     what the fit found out about its photos.
 
-    As many steps as on a CPU, each of 32 times the samples. ``on_step`` hears every 16th. ``clock``: of the fit, which
-    may have begun before this.
+    As many steps as on a CPU, each of 32 times the samples. ``told``: who hears of looks, and of every 16th step.
+    ``clock``: of the fit, which may have begun before this. ``how``: whether it may be given up; whether it goes on
+    where another ended.
 
     Raises:
+        _StuckError: of a fit that may be given up, it leads nowhere.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row.
     """
     home, device = model.encoding.tables.device, torch.device("cuda", torch.cuda.current_device())
@@ -60,14 +61,14 @@ def fit_on_gpu(
     move(model, device)
     try:
         with torch.device(device):  # what is made in here without a device named is made on the GPU
-            fit = _GpuFit(model, photos, config, (known, outside), (on_progress, on_step), clock)
-            fit.run()
+            fit = _GpuFit(model, photos, config, (known, outside), told, clock, goes_on=how[1])
+            fit.run(how[0])
             return fit.photos.told(capture, fit.judge, model)
     finally:
         move(model, home)
 
 
-def move(model: HashField, device: torch.device) -> None:
+def move(model: HashField | NerfactoField, device: torch.device) -> None:
     """The field's parameters and its sampler to a device, in place."""
     model.to(device)
     space = model.sampler.contraction
@@ -76,7 +77,7 @@ def move(model: HashField, device: torch.device) -> None:
     model.sampler = replace(model.sampler, contraction=space, grid=grid, fine=None if fine is None else fine.to(device))
 
 
-class _GpuFit:
+class _GpuFit(Fitting):
     """The state of one run of :func:`fit_on_gpu`."""
 
     def __init__(
@@ -87,21 +88,21 @@ class _GpuFit:
         places: tuple[tuple[torch.Tensor, torch.Tensor], bool],
         told: tuple[ProgressCallback | None, StepCallback | None],
         clock: Compiling | None = None,
+        goes_on: bool = False,
     ) -> None:
         """``places``: cells that are `Photos.knowable`, and those `beside` cameras; whether these `stand_outside`."""
         (allowed, near), outside = places
-        self.on_progress, self.on_step = told
-        self.model, self.config = model, config
         device = model.encoding.tables.device
         with torch.device("cpu"):  # photos are read and posed there
             bank = photos.bank()
             brightness = bank.brightness
-            self.distortion = config.distortion * brightness**2  # as `fit._Fit`
             self.pixels = DevicePixels(bank, device)
             del bank  # large
-            self.judge = photos.judge()
-        self.judge.move(device)
-        self.photos = PhotoModel(self.pixels, model.sampler, config.photos)
+            judge = photos.judge()
+        judge.move(device)
+        learnt = PhotoModel(self.pixels, model.sampler, config.photos)
+        super().__init__(model, (learnt, judge), config, told, clock, goes_on)
+        self.distortion = config.distortion * brightness**2  # as `fit._Fit`
         self.occupancy = OccupancyTrainer(model, allowed=allowed, outside=outside, beside=near if outside else None)
         model.looking_where(allowed.to(torch.uint8).reshape(model.sampler.grid.shape))
         self.grid = model.sampler.grid.clone()  # the one that graphs read
@@ -110,40 +111,36 @@ class _GpuFit:
         self.capacity = config.samples * _BATCH
         self.rays_per_step, self.coarseness = _SIZES[0], COARSEST
         self.finest_step = model.sampler.step
-        self.clock, self.rays_done, self.step = clock or Compiling(), 0, 0
+        self.samples_per_ray = math.nan
 
-    def run(self) -> None:
-        self.model.train()
-        try:
-            samples = self._steps()
-        except NonFiniteError:
-            self._settle()
-            raise
-        self._settle()
-        self._look(self.step, samples / self.rays_per_step)
+    @property
+    def per_ray(self) -> float:
+        return self.samples_per_ray
 
-    def _settle(self) -> None:
+    def settle(self) -> None:
         self.occupancy.settle(self.pixels)
         self.model.sampler = self.model.sampler.for_pictures()
 
-    def _steps(self) -> int:
-        """All rounds of steps, each followed by what a graph cannot hold; returns the samples of the last step."""
+    def steps(self, may_give_up: bool) -> None:
+        """All rounds of steps, each followed by what a graph cannot hold."""
         due = self.config.check_every
         graph, step = self._captured(0)
-        while self._progress(step) < 1:
+        while self.progress(step) < 1:
             stage = self.photos.stage(graph.progress)
             step = self._round(graph, step)
-            self.step, samples = step, int(graph.samples)
+            samples = int(graph.samples)
+            self.steps_done, self.samples_per_ray, self.loss = step, samples / self.rays_per_step, float(graph.loss)
             if self.on_step:
                 self.on_step(step, self.model)
             if int(self.descent.bad) >= MOST_SKIPPED:
                 raise NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
+            if may_give_up:
+                self.give_up_if_stuck(within=EVERY)
             if step >= due:
                 due += self.config.check_every
-                self._look(step, samples / self.rays_per_step)
+                self.look()
             if self._resized(samples) or self.photos.stage(self._expose(step)) != stage:
                 graph, step = self._captured(step)
-        return int(graph.samples)
 
     def _round(self, graph: GraphedStep, step: int) -> int:
         """Steps up to the next update of the occupancy grid, and that."""
@@ -175,28 +172,23 @@ class _GpuFit:
         self._set_rate(step)
         return graph, step + graph.capture()
 
-    def _progress(self, step: int) -> float:
-        return progress_of(self.config, step, self.clock.worked)
-
     def _expose(self, step: int) -> float:
         """How far the fit is; and find out, when that is due, whether photos are exposed alike."""
-        progress = self._progress(step)
-        if self.photos.may_expose(max(step / self.config.steps, progress / 2)):
-            self.photos.exposing = self.judge.tells_exposures(self.model)
-            self.model.train()
+        progress = self.progress(step)
+        self.may_expose(step, progress)
         return progress
 
     def _learn(self, graph: GraphedStep, step: int) -> None:
         """What a replay found goes to the photos; outside of the graph, since it solves equations."""
         assert graph.asked is not None and graph.found is not None
-        progress = self._progress(step)
-        self.photos.learn(graph.asked, graph.found, progress, rate_factor(progress))
+        progress = self.progress(step)
+        self.photos.learn(graph.asked, graph.found, progress, self.rate_factor(progress))
 
     def _set_rate(self, step: int) -> None:
         self.descent.rate.fill_(self._rate(step))
 
     def _rate(self, step: int) -> float:
-        return self.config.rate * rate_factor(self._progress(step))
+        return self.config.rate * self.rate_factor(self.progress(step))
 
     def _resized(self, samples: int) -> bool:
         """Choose the rays of a step and the lattice anew, after a step with so many samples; whether either changed."""
@@ -213,14 +205,3 @@ class _GpuFit:
         if overfull or wanted < rays or wanted > 1.4 * rays or self.coarseness != coarseness:
             self.rays_per_step = wanted
         return (self.rays_per_step, self.coarseness) != (rays, coarseness)
-
-    def _look(self, step: int, samples_per_ray: float) -> None:
-        if self.on_progress is None:
-            return
-        self.photos.inform(self.judge)
-        psnr = self.judge.psnr(self.model, self.photos.exposing)
-        self.model.train()
-        worked = self.clock.worked
-        left, seconds = seconds_left(self.config, step, worked), worked + self.clock.seconds
-        speed = self.rays_done / seconds
-        self.on_progress(FitProgress(step, self.config.steps, psnr, speed, samples_per_ray, seconds, left))
