@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
+from collections.abc import Callable
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,7 @@ import torch
 from torch import Tensor
 
 from refield.field.encoding import geometric_levels
-from refield.field.fit import FitConfig
+from refield.field.fit import FitConfig, Fitting, _StuckError
 from refield.field.kernels import reference
 from refield.field.kernels.reference import Aim, Batch, Stepped
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
@@ -23,7 +25,7 @@ from refield.field.placing import new_field
 from refield.field.radiance import HashField, HashFieldConfig
 from refield.field.sampling import IN_PICTURES
 from refield.scene.camera import Camera
-from refield.scene.capture import Frame
+from refield.scene.capture import Capture, Frame
 from tests.captures import CAMERA, DISTORTED, ring
 from tests.field.scenes import room
 from tests.fields import small_field
@@ -517,6 +519,57 @@ def roomy(*parts: object, capacity: int) -> Stepped:
     return found._replace(loss=torch.tensor(found.loss), cells=cells, weights=w, sigmas=sigmas)
 
 
+def small_steps(monkeypatch: pytest.MonkeyPatch, capture: Callable[[GraphedStep], int]) -> None:
+    """Let the loop take few rays a step, by the reference's step, and none of its graphs."""
+    monkeypatch.setattr(gpu_fit, "_SIZES", [16])
+    monkeypatch.setattr(gpu_fit, "EVERY", 3)
+    monkeypatch.setattr(GraphedStep, "capture", capture)
+    monkeypatch.setattr(GraphedStep, "replay", GraphedStep.run_eager)
+    monkeypatch.setattr(gpu, "train_step", roomy)
+
+
+def loop(capture: Capture, config: FitConfig, goes_on: bool = False) -> gpu_fit._GpuFit:
+    """A fit of a small field, as `fit_on_gpu` begins one."""
+    shape = HashFieldConfig(levels=2, coarsest=8, finest=16, log2_table=10, width=16)
+    config = replace(config, samples=32, check_every=10**6, field=shape, finest_auto=False)
+    torch.manual_seed(0)
+    model = new_field(capture, config, 0).train()
+    everywhere = torch.ones(model.sampler.resolution**3, dtype=torch.bool)
+    places = ((everywhere, ~everywhere), True)
+    return gpu_fit._GpuFit(model, Photos.of(capture), config, places, (None, None), goes_on=goes_on)
+
+
+@pytest.mark.skipif(ON_GPU, reason="steps are the reference's, on the CPU")
+def test_the_loop_gives_up_and_goes_on_as_on_a_cpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def eager(step: GraphedStep) -> int:
+        step.run_eager()
+        return 1
+
+    small_steps(monkeypatch, eager)
+    capture, config = room(tmp_path), FitConfig(steps=6)
+    rates: list[float] = []
+    whole = Descent.step
+    monkeypatch.setattr(Descent, "step", lambda d, loss: (rates.append(float(d.rate)), whole(d, loss))[1])
+    asked: list[int] = []
+    monkeypatch.setattr(Fitting, "_stuck", lambda fit, within: asked.append(fit.steps_done) or within != 3)
+    loop(capture, config).run(may_give_up=True)
+    assert asked == [3, 6] and max(rates) == pytest.approx(config.rate)
+    rates.clear()
+    loop(capture, config, goes_on=True).run()
+    assert asked == [3, 6] and config.rate / 40 < min(rates) and max(rates) < 1.001 * config.rate
+    assert sum(rates) < 4 * config.rate  # as in the second half of a fit that begins
+    monkeypatch.setattr(Fitting, "_stuck", lambda fit, within: fit.steps_done == 3)
+    with pytest.raises(_StuckError):
+        loop(capture, config).run(may_give_up=True)
+
+
+def test_a_step_is_no_larger_than_the_photos_are_worth() -> None:
+    config = FitConfig(steps=1000, samples=8000)
+    assert gpu_fit._room(config, 10**9) == 32 * config.samples
+    assert gpu_fit._room(config, 400_000) == 100 * 400_000 / 1000
+    assert gpu_fit._room(config, 100) == config.samples
+
+
 @pytest.mark.skipif(ON_GPU, reason="steps are the reference's, on the CPU")
 def test_the_loop_finds_out_about_photos_as_the_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stages: list[tuple[bool, ...]] = []
@@ -527,21 +580,13 @@ def test_the_loop_finds_out_about_photos_as_the_fit_goes_on(tmp_path: Path, monk
         step.run_eager()
         return 1
 
-    monkeypatch.setattr(gpu_fit, "_SIZES", [16])
-    monkeypatch.setattr(gpu_fit, "EVERY", 3)
-    monkeypatch.setattr(GraphedStep, "capture", eager)
-    monkeypatch.setattr(GraphedStep, "replay", GraphedStep.run_eager)
-    monkeypatch.setattr(gpu, "train_step", roomy)
+    small_steps(monkeypatch, eager)
     monkeypatch.setattr(HeldOut, "tells_exposures", lambda self, model: True)
     capture = room(tmp_path)
-    shape = HashFieldConfig(levels=2, coarsest=8, finest=16, log2_table=10, width=16)
     asked = PhotoModelConfig(exposures=True, poses=True, trust=True)
-    config = FitConfig(steps=60, samples=32, check_every=10**6, field=shape, finest_auto=False, photos=asked)
-    torch.manual_seed(0)
-    model = new_field(capture, config, 0).train()
-    everywhere = torch.ones(model.sampler.resolution**3, dtype=torch.bool)
-    fit = gpu_fit._GpuFit(model, Photos.of(capture), config, ((everywhere, ~everywhere), True), (None, None))
+    fit = loop(capture, FitConfig(steps=60, photos=asked))
     fit.run()
+    model = fit.model
     # exposed, plain, trust, poses
     expected = [(False, True, False, False), (False, True, True, False), (True, True, True, False)]
     assert list(dict.fromkeys(stages)) == [*expected, (True, False, True, True)]
