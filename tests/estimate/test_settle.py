@@ -410,6 +410,27 @@ def test_what_slid_by_less_than_its_width_is_found_where_it_hid(tmp_path, monkey
     assert [o.kind for o in without.objects] != ["moved"]
 
 
+def test_things_that_touch_and_turned_each_where_it_stands_are_cut_apart(tmp_path):
+    """They are outlined as one, and by one of them alone less is explained than a newcomer would explain."""
+    things = standing((0.2, 0.17, 0.18), -0.2, -0.15, 0, paint=3), standing((0.12, 0.14, 0.3), 0.12, -0.15, 0, paint=7)
+    turns = [turn(b.world_from_box[:3, 3], angle, (0, 0, 0)) for b, angle in zip(things, (28, -35))]
+    before, after = BoxWorld(things), BoxWorld(tuple(b.moved(t) for b, t in zip(things, turns)))
+    capture, frames = capture_of(before, tmp_path / "before"), new_photos(after, tmp_path / "after")
+    change = recipe.estimate_change(capture, before, frames, CONFIG)
+    assert [o.kind for o in change.objects] == ["moved", "moved"]
+    for true in turns:
+        assert min(float(angle_between(o.new_from_old, true)) for o in change.objects) < 1.5
+
+
+def test_a_piece_is_told_only_for_as_much_as_a_pose_must_gain(estimated):
+    ground, _, changed, found = estimated
+    search, (k,) = settle.Search(ground, changed), found.moved
+    new = replace(found, olds=(*found.olds, found.olds[k]), moved={1: found.moved[k]}, touched=(1,))
+    least = ground.believe.gains * pixels_of(ground, new, 1)
+    assert search._worth(found, new, ("cut", 1, 0)) == pytest.approx(least + 1) and least > 100
+    assert search._worth(found, new, ("slid", 1, 0)) == search._worth(found, found, ("parted", 1, 0)) == 1
+
+
 @pytest.mark.parametrize("known", [False, True])
 def test_an_object_that_explains_nothing_is_taken_back(capture, tmp_path, monkeypatch, known):
     """A pose that was believed at first, of a thing that is elsewhere: where it was found before, if anywhere."""

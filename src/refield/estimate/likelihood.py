@@ -79,6 +79,11 @@ def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     return told, cost + sum(float(e.sum()) for e in left)
 
 
+def wrong_at(ground: Ground, settled: Settled) -> list[Array]:
+    """(H, W) what the hypothesis leaves unexplained of each pixel of each photo, newcomers left out."""
+    return [_left(ground, settled, p)[0] for p in settled.views]
+
+
 def _left(ground: Ground, settled: Settled, p: Past) -> tuple[Array, Mask, list[Mask]]:
     """(H, W) what is left unexplained of each pixel of a photo, but for what arrived; the pixels of which it is known
     what they show without that; and those that show each of the objects that moved."""

@@ -20,6 +20,7 @@ from refield.estimate.arrive import exactly, fresh, newcomers, remarkable, shado
 from refield.estimate.associate import may_have_changed, place_all, places_of, without
 from refield.estimate.comoving import with_comoving
 from refield.estimate.consist import consistent
+from refield.estimate.cost import CAME, price
 from refield.estimate.detect import Changed
 from refield.estimate.fit import (
     ALIKE,
@@ -28,6 +29,7 @@ from refield.estimate.fit import (
     at_one_place,
     believed,
     gains_enough,
+    is_among,
     left_by,
     places_among,
     rest_of,
@@ -37,13 +39,14 @@ from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
 from refield.estimate.lattice import Body
 from refield.estimate.layers import Sight
-from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of
+from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of, wrong_at
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import as_one, standing
-from refield.estimate.past import Past
+from refield.estimate.past import Past, silhouette
 from refield.estimate.pose_change import FINER, PoseChange, refine
 from refield.estimate.rotations import best_rotations, may_be_turned, rotated_at
+from refield.estimate.split import halves
 from refield.scene.pose import invert, transform
 from refield.vision import pixels
 
@@ -73,6 +76,8 @@ class Search:
     """where what left may be among what arrived"""
     rotated: Kept[list[tuple[Array, list[tuple[Old, PoseChange]]]]] = field(default_factory=Kept)
     """how what left may be rotated, place by place"""
+    pieces: Kept[list[Old]] = field(default_factory=Kept)
+    """of an outline, that changed"""
     hypotheses: Kept[Settled] = field(default_factory=lambda: Kept(32))
     """by what was, what was touched and where it is"""
     outlined: Kept[Old | None] = field(default_factory=Kept)
@@ -95,11 +100,19 @@ class Search:
                     continue
                 others = [judged(self.ground, other) for other in tries(best)]
                 other, tried[this] = min(others, key=lambda o: o[1], default=(best, math.inf))
-                if tried[this] < least - 1:  # pixel
+                if tried[this] < least - self._worth(best, other, this):
                     again, best, least, tried = True, other, tried[this], {}
         if begun is not None and judged(self.ground, begun)[1] <= least:
             return begun
         return self._led(best, least, tried)
+
+    def _worth(self, best: Settled, other: Settled, this: _Which) -> float:
+        """How many pixels less an exchange must leave unexplained. A piece fits more easily than a thing: it must gain
+        as much of its pixels as a pose does that is believed."""
+        if this[0] not in ("cut", "parted"):
+            return 1.0
+        pieces = [k for k in other.moved if k >= len(best.olds)]
+        return self.ground.believe.gains * sum(pixels_of(self.ground, other, k) for k in pieces) + 1
 
     def turned(self, told: Settled) -> Settled:
         """What was settled, with each object rotated about its place as the photos show more of it, where they show
@@ -149,7 +162,7 @@ class Search:
 
     def _exchanges(self, best: Settled) -> list[tuple[_Which, _Tries]]:
         """What is tried beside a hypothesis, each with what tells it from the others."""
-        changed = (*best.moved, *best.removed)
+        changed, pieces = (*best.moved, *best.removed), self._pieces(best)
         return [
             *((("elsewhere", k, 0), partial(self._elsewhere, k=k)) for k in self.fits),
             *((("turned", k, 0), partial(self._turned, k=k)) for k in best.moved),
@@ -158,7 +171,78 @@ class Search:
             *((("outlined", k, 0), partial(self._outlines, k=k)) for k in changed),
             *((("joined", k, 0), partial(self._joined, k=k)) for k in best.moved if len(best.moved) > 1),
             *((("slid", k, id(one)), partial(self._slides, k=k, one=one)) for k, one in self._asked(best)),
+            *((("cut", len(best.olds), id(one)), partial(self._cut, one=one)) for one in pieces),
+            *((("parted", len(best.olds), 0), partial(self._parted, pieces=pieces)) for _ in pieces[1:2]),
         ]
+
+    def _pieces(self, best: Settled) -> list[Old]:
+        """Pieces of what was outlined at first that changed, and of which more is left unexplained than a newcomer
+        there would leave; those where most is left come first."""
+        wrong, believe = wrong_at(self.ground, best), self.ground.believe
+
+        def left_at(one: Old, least: float) -> float:
+            """What is left unexplained where it was; 0 if that is too little."""
+            shown = [silhouette(p.view, one) for p in best.views]
+            left = sum(float(w[s].sum()) for w, s in zip(wrong, shown))
+            enough = max(least * sum(int(s.sum()) for s in shown), price(shown, believe.smallest))
+            return left if left > enough else 0.0
+
+        worth: list[tuple[float, Old]] = []
+        for old in self.first.values():
+            if left_at(old.outlines[-1], 0.0):
+                pieces = self.pieces.get((old,), partial(_cut_up, self.ground, self.changed, old))
+                worth += [(left, one) for one in pieces if (left := left_at(one, CAME))]
+        worth.sort(key=lambda w: -w[0])
+        return [one for _, one in worth[: believe.most]]
+
+    def _cut(self, best: Settled, one: Old) -> Iterator[Settled]:
+        """With a piece of an outline, or all that went along with it, for a thing that turned or slid about where it
+        was; the others of which it is a piece as they are told, or not moved."""
+        k, around = len(best.olds), [j for j in best.moved if one.within(best.olds[j])]
+        alone = replace(best, moved={j: c for j, c in best.moved.items() if j not in around})
+        fits: list[tuple[Old, PoseChange]] = []
+        for fit in self._places(alone, one):
+            if is_among(fit.change, [best.moved[j] for j in around], fit.old):  # what went along is asked elsewhere
+                continue
+            change = self._refined(alone, k, fit.old, fit.change)
+            if change is not None and _noticeable(fit.old, change, self.ground.believe.still):
+                fits.append((fit.old, change))
+                for told in (best, alone) if around else (best,):
+                    yield self._with(told, k, fit.old, change)
+        if fits:
+            old, change = max(fits, key=lambda f: f[1].net)
+            along = self._outlined(alone, k, old, change)
+            again = None if along is None else self._refined(alone, k, along, change)
+            if along is not None and again is not None:
+                yield self._with(alone, k, along, again)
+
+    def _parted(self, best: Settled, pieces: Sequence[Old]) -> Iterator[Settled]:
+        """With several pieces for things, each where most of it is explained: one alone may leave more to a newcomer
+        than it explains."""
+        found = [fits[0] for one in pieces if (fits := self._places(best, one))]
+        taken, now = list[Old](), best
+        for fit in sorted(found, key=lambda f: -f.change.net):
+            if any(fit.old.within(o) or o.within(fit.old) for o in taken):
+                continue
+            k, around = len(now.olds), [j for j in now.moved if fit.old.within(now.olds[j])]
+            alone = replace(now, moved={j: c for j, c in now.moved.items() if j not in around})
+            change = self._refined(alone, k, fit.old, fit.change)
+            if change is not None and _noticeable(fit.old, change, self.ground.believe.still):
+                now = self._with(alone, k, fit.old, change)
+                taken.append(fit.old)
+        if len(taken) > 1:
+            yield now
+
+    def _places(self, best: Settled, one: Old) -> list[Fit]:
+        """Where a piece of an outline may be about where it was, as it is asked for first. What went elsewhere is found
+        as a whole, or by half."""
+
+        def found() -> Fit | None:
+            gone, views = self._without(best, len(best.olds), one)
+            return slid(self.ground, one, gone, views)
+
+        fit = self.slides.get((one,), found)
+        return [] if fit is None else [fit, *fit.rivals]
 
     def _placed(self, olds: Sequence[Old], begun: Settled) -> Settled:
         """The hypothesis that more objects are where each is found by itself, one after the other."""
@@ -372,6 +456,15 @@ class Search:
             whole = self.wholes.get((piece,), partial(standing, g.field, g.photographed, piece, g.planes, g.shape))
             out += [(k, whole)] if whole is not None else []
         return out
+
+
+def _cut_up(ground: Ground, changed: Sequence[Changed], old: Old, times: int = 3) -> list[Old]:
+    """Halves of an outline, their halves, and so on, as far as they changed."""
+    out: list[Old] = []
+    for one, _ in halves(old.outlines[-1], ground.shape) if times and not old.remembered else ():
+        out += [one] if may_have_changed(ground, changed, one) else []
+        out += _cut_up(ground, changed, one, times - 1)
+    return out
 
 
 def _box(body: Body) -> Array:
