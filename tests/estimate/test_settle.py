@@ -422,6 +422,17 @@ def test_things_that_touch_and_turned_each_where_it_stands_are_cut_apart(tmp_pat
         assert min(float(angle_between(o.new_from_old, true)) for o in change.objects) < 1.5
 
 
+def test_pieces_are_those_of_the_hypothesis_that_they_are_asked_beside(estimated, monkeypatch):
+    """Exchanges are listed once, and a better hypothesis may be taken before it is their turn."""
+    ground, _, changed, found = estimated
+    search, asked = settle.Search(ground, changed), []
+    monkeypatch.setattr(settle.Search, "_pieces", lambda self, best: asked.append(best) or [found.olds[0]])
+    exchanges = dict(search._exchanges(found))
+    better = replace(found)
+    assert list(exchanges["parted", 0, 0](better)) == [] and asked == [found, better] and asked[1] is better
+    assert ("cut", 0, id(found.olds[0])) in exchanges
+
+
 def test_a_piece_is_told_only_for_as_much_as_a_pose_must_gain(estimated):
     ground, _, changed, found = estimated
     search, (k,) = settle.Search(ground, changed), found.moved

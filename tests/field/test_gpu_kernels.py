@@ -564,9 +564,10 @@ def test_the_loop_gives_up_and_goes_on_as_on_a_cpu(tmp_path: Path, monkeypatch: 
 
 
 def test_a_step_is_no_larger_than_the_photos_are_worth() -> None:
-    config = FitConfig(steps=1000, samples=8000)
+    config = FitConfig(steps=1000, samples=30_000)
     assert gpu_fit._room(config, 10**9) == 32 * config.samples
     assert gpu_fit._room(config, 400_000) == 100 * 400_000 / 1000
+    assert gpu_fit._room(replace(config, samples=8000), 100) * 0.95 > 512 * config.samples_per_ray - 1
     assert gpu_fit._room(config, 100) == config.samples
 
 

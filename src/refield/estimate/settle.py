@@ -108,7 +108,7 @@ class Search:
 
     def _worth(self, best: Settled, other: Settled, this: _Which) -> float:
         """How many pixels less an exchange must leave unexplained. A piece fits more easily than a thing: it must gain
-        as much of its pixels as a pose does that is believed."""
+        the part of its pixels, where it was and where it is, that a pose must which is believed."""
         if this[0] not in ("cut", "parted"):
             return 1.0
         pieces = [k for k in other.moved if k >= len(best.olds)]
@@ -171,13 +171,13 @@ class Search:
             *((("outlined", k, 0), partial(self._outlines, k=k)) for k in changed),
             *((("joined", k, 0), partial(self._joined, k=k)) for k in best.moved if len(best.moved) > 1),
             *((("slid", k, id(one)), partial(self._slides, k=k, one=one)) for k, one in self._asked(best)),
-            *((("cut", len(best.olds), id(one)), partial(self._cut, one=one)) for one in pieces),
-            *((("parted", len(best.olds), 0), partial(self._parted, pieces=pieces)) for _ in pieces[1:2]),
+            *((("cut", 0, id(one)), partial(self._cut, one=one)) for one in pieces),
+            *([(("parted", 0, 0), self._parted)] if pieces else []),
         ]
 
     def _pieces(self, best: Settled) -> list[Old]:
-        """Pieces of what was outlined at first that changed, and of which more is left unexplained than a newcomer
-        there would leave; those where most is left come first."""
+        """Pieces of what was outlined at first that changed, and of which more is left unexplained than the pixels of a
+        newcomer cost; those where most is left come first."""
         wrong, believe = wrong_at(self.ground, best), self.ground.believe
 
         def left_at(one: Old, least: float) -> float:
@@ -214,12 +214,13 @@ class Search:
             along = self._outlined(alone, k, old, change)
             again = None if along is None else self._refined(alone, k, along, change)
             if along is not None and again is not None:
+                self.anew[id(along)] = along
                 yield self._with(alone, k, along, again)
 
-    def _parted(self, best: Settled, pieces: Sequence[Old]) -> Iterator[Settled]:
+    def _parted(self, best: Settled) -> Iterator[Settled]:
         """With several pieces for things, each where most of it is explained: one alone may leave more to a newcomer
         than it explains."""
-        found = [fits[0] for one in pieces if (fits := self._places(best, one))]
+        found = [fits[0] for one in self._pieces(best) if (fits := self._places(best, one))]
         taken, now = list[Old](), best
         for fit in sorted(found, key=lambda f: -f.change.net):
             if any(fit.old.within(o) or o.within(fit.old) for o in taken):
@@ -459,7 +460,7 @@ class Search:
 
 
 def _cut_up(ground: Ground, changed: Sequence[Changed], old: Old, times: int = 3) -> list[Old]:
-    """Halves of an outline, their halves, and so on, as far as they changed."""
+    """Halves of an outline, their halves, and so on; those of them that changed."""
     out: list[Old] = []
     for one, _ in halves(old.outlines[-1], ground.shape) if times and not old.remembered else ():
         out += [one] if may_have_changed(ground, changed, one) else []

@@ -31,8 +31,8 @@ from refield.scene.capture import Capture
 
 _BATCH = 32  # times the samples of a step on a CPU, where the photos hold enough for it
 # Samples of a whole fit for each of its pixels, at most. Of 12 random worlds, 70 photos at 128 x 128, left-out photos
-# have 29.7 dB with 456 samples a pixel, which learn noise by heart, 29.8 with 114, 30.2 with 57, 30.1 with 14; `fox`
-# has 31.1 with 160, and with 32 in smaller tables 29.7
+# have 29.7 dB with 456 samples a pixel, which learn noise by heart, 29.8 with 114, 30.2 with 57 in a thousand steps or
+# more, 30.1 with 14; `fox` has 31.1 with 160, and with 32 in smaller tables 29.7
 _PER_PIXEL = 100
 # two sizes an octave: a step's room for samples is at least half full, and few graphs are captured
 _SIZES = sorted([1 << k for k in range(9, 18)] + [3 << k for k in range(8, 16)])
@@ -133,11 +133,14 @@ class _GpuFit(Fitting):
             stage = self.photos.stage(graph.progress)
             step = self._round(graph, step)
             samples = int(graph.samples)
-            self.steps_done, self.samples_per_ray, self.loss = step, samples / self.rays_per_step, float(graph.loss)
+            self.steps_done, self.samples_per_ray, loss = step, samples / self.rays_per_step, float(graph.loss)
+            self.loss = loss if math.isfinite(loss) else self.loss
             if self.on_step:
                 self.on_step(step, self.model)
             if int(self.descent.bad) >= MOST_SKIPPED:
-                raise NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
+                error = NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
+                error.steps = int(self.descent.count)
+                raise error
             if may_give_up:
                 self.give_up_if_stuck(within=EVERY)
             if step >= due:
@@ -212,6 +215,7 @@ class _GpuFit(Fitting):
 
 
 def _room(config: FitConfig, pixels: int) -> int:
-    """For the samples of a step, of a fit to so many pixels."""
+    """For the samples of a step, of a fit to so many pixels; at least for the fewest rays while they are longest."""
     most = _PER_PIXEL * pixels / (config.steps * config.samples)
-    return round(config.samples * min(max(most, 1), _BATCH))
+    least = int(_SIZES[0] * config.samples_per_ray / _ROOM)
+    return max(round(config.samples * min(max(most, 1), _BATCH)), least)
