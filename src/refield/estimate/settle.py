@@ -198,11 +198,11 @@ class Search:
     def _cut(self, best: Settled, one: Old) -> Iterator[Settled]:
         """With a piece of an outline, or all that went along with it, for a thing that turned or slid about where it
         was; the others of which it is a piece as they are told, or not moved."""
-        k, around = len(best.olds), [j for j in best.moved if one.within(best.olds[j])]
-        alone = replace(best, moved={j: c for j, c in best.moved.items() if j not in around})
+        k, alone = len(best.olds), _without_moves_around(best, one)
+        around = [c for j, c in best.moved.items() if j not in alone.moved]
         fits: list[tuple[Old, PoseChange]] = []
         for fit in self._places(alone, one):
-            if is_among(fit.change, [best.moved[j] for j in around], fit.old):  # what went along is asked elsewhere
+            if is_among(fit.change, around, fit.old):  # what went along is asked elsewhere
                 continue
             change = self._refined(alone, k, fit.old, fit.change)
             if change is not None and _noticeable(fit.old, change, self.ground.believe.still):
@@ -225,8 +225,7 @@ class Search:
         for fit in sorted(found, key=lambda f: -f.change.net):
             if any(fit.old.within(o) or o.within(fit.old) for o in taken):
                 continue
-            k, around = len(now.olds), [j for j in now.moved if fit.old.within(now.olds[j])]
-            alone = replace(now, moved={j: c for j, c in now.moved.items() if j not in around})
+            k, alone = len(now.olds), _without_moves_around(now, fit.old)
             change = self._refined(alone, k, fit.old, fit.change)
             if change is not None and _noticeable(fit.old, change, self.ground.believe.still):
                 now = self._with(alone, k, fit.old, change)
@@ -457,6 +456,11 @@ class Search:
             whole = self.wholes.get((piece,), partial(standing, g.field, g.photographed, piece, g.planes, g.shape))
             out += [(k, whole)] if whole is not None else []
         return out
+
+
+def _without_moves_around(best: Settled, one: Old) -> Settled:
+    """The hypothesis that what a piece is of did not move, but for the piece."""
+    return replace(best, moved={j: c for j, c in best.moved.items() if not one.within(best.olds[j])})
 
 
 def _cut_up(ground: Ground, changed: Sequence[Changed], old: Old, times: int = 3) -> list[Old]:

@@ -267,11 +267,8 @@ class Fitting:
         self.loss = math.nan
         self.first: tuple[float, float] | None = None  # at the first step that `_stuck` asks
         self.rays_done, self.steps_done = 0, 0
-
-    @property
-    def per_ray(self) -> float:
-        """Samples, of late."""
-        raise NotImplementedError
+        self.samples_per_ray = math.nan
+        """of late"""
 
     def steps(self, may_give_up: bool) -> None:
         """Raises _StuckError early on if the fit leads nowhere and ``may_give_up``."""
@@ -333,7 +330,7 @@ class Fitting:
         worked, step = self.clock.worked, self.steps_done
         left, seconds = seconds_left(self.config, step, worked), worked + self.clock.seconds
         speed = self.rays_done / seconds
-        self.on_progress(FitProgress(step, self.config.steps, psnr, speed, self.per_ray, seconds, left))
+        self.on_progress(FitProgress(step, self.config.steps, psnr, speed, self.samples_per_ray, seconds, left))
 
 
 class _Fit(Fitting):
@@ -366,10 +363,6 @@ class _Fit(Fitting):
         self.samples_per_ray = config.samples / 512
         self.finest_step, self.coarseness = model.sampler.step, 1.0
         self._set_coarseness(COARSEST)
-
-    @property
-    def per_ray(self) -> float:
-        return self.samples_per_ray
 
     def settle(self) -> None:
         self.occupancy.settle(self.pixels)

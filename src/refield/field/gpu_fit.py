@@ -115,11 +115,6 @@ class _GpuFit(Fitting):
         self.capacity = _room(config, len(self.pixels))
         self.rays_per_step, self.coarseness = _SIZES[0], COARSEST
         self.finest_step = model.sampler.step
-        self.samples_per_ray = math.nan
-
-    @property
-    def per_ray(self) -> float:
-        return self.samples_per_ray
 
     def settle(self) -> None:
         self.occupancy.settle(self.pixels)
