@@ -116,6 +116,24 @@ def test_errors_grow_where_fewer_photos_looked_and_never_shrink():
     assert (few == few[-1]).all()
 
 
+def test_what_left_out_photos_show_is_chance_and_no_threshold(tmp_path):
+    """A field that is wrong in photos it did not learn from: as much of a new one is not unusual, and is masked."""
+    taught = photograph(OLD, tmp_path / "old", AROUND)
+    (beside,) = views_of(OLD, tmp_path / "beside", [camera_at(100, 30)])
+    on_crate = CRATE.inside(torch.nan_to_num(torch.from_numpy(beside.surface + 0.02 * beside.directions))).numpy()
+    wrong = replace(beside, photo=np.where(on_crate[..., None], 1 - beside.photo, beside.photo).astype(np.float32))
+    survey, memory, config = [view_of(OLD, f, 10_000) for f in taught], Memory.of(OLD, taught), DetectConfig()
+    alone = detect.errors(survey, memory, config)
+    known = detect.errors(survey, memory, config, [wrong] * 3)
+    (new,) = detect.changes([wrong], known, config)
+    assert new.mask[on_crate].mean() > 0.7
+    assert len(known.by_chance) == len(survey) + 3 and known.by_chance[-1] == pytest.approx(float(new.mask.mean()))
+    assert len(known.shown) == len(alone.shown)
+    assert (known.levels == alone.levels).all() and (known.seeds == alone.seeds).all()
+    share = [float(new.mask.mean())]
+    assert alone.unusual(share) and not known.unusual(share)
+
+
 def test_as_much_as_chance_makes_is_not_unusual():
     """Of 400 times that nothing changed hardly any is said to be unusual; ten times as much nearly always is."""
     rng = np.random.default_rng(0)

@@ -93,7 +93,8 @@ class Errors:
     seeds: Array
     """(C,) a change is larger than this somewhere"""
     by_chance: tuple[float, ...] = ()
-    """the part of each of some of those photos that would be taken for changed if it were new"""
+    """the part of each of those photos, and of others that the field did not learn from, that would be taken for
+    changed if it were new"""
 
     def unusual(self, shares: Sequence[float]) -> bool:
         """Whether new photos' changed parts are more than the field's errors make of as many photos without a change.
@@ -144,17 +145,22 @@ def noise_at(view: View, survey: Sequence[Changed]) -> Array:
     return mean.reshape(view.shape)
 
 
-def errors(photos: Sequence[View], memory: Memory, config: DetectConfig) -> Errors:
-    """The field's own errors, in ``photos`` of the old state."""
-    shown = tuple(_unchanged(v, config) for v in photos)
+def errors(photos: Sequence[View], memory: Memory, config: DetectConfig, left_out: Sequence[View] = ()) -> Errors:
+    """The field's own errors, in ``photos`` of the old state.
+
+    ``left_out``: others, that the field did not learn from, as it did not from new ones. They tell how much of such a
+    photo would be taken for changed; not what counts as a change, since where a few of them show the field wrong, true
+    changes were missed as well (docs/results.md).
+    """
+    shown, others = (tuple(_unchanged(v, config) for v in views) for views in (photos, left_out))
     of = np.concatenate([_coverage(memory.times_seen(s.view)).ravel() for s in shown])
     known = np.concatenate([s.difference.ravel() for s in shown])
     levels, seeds = (_by_coverage(known, of, q) for q in (config.noise_quantile, config.seed_quantile))
     levels, seeds = np.maximum(config.floor, levels), 1.3 * np.maximum(config.floor, seeds)
     shares = []
-    for one in shown:
-        others = Errors(tuple(s for s in shown if s is not one), memory, levels, seeds)
-        (found,) = _marked([one.view], [one.difference], others, config)
+    for one in (*shown, *others):
+        beside = Errors(tuple(s for s in shown if s is not one), memory, levels, seeds)
+        (found,) = _marked([one.view], [one.difference], beside, config)
         shares.append(float(found.mask.mean()))
     return Errors(shown, memory, levels, seeds, tuple(shares))
 

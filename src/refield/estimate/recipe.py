@@ -165,10 +165,13 @@ def estimate_change(
 def _detected(
     capture: Capture, field: Field, frames: Sequence[Frame], config: EstimateConfig, models: Models
 ) -> _Scene:
-    survey = [look.view_of(field, f, config.max_pixels) for f in look.spread_out(capture.frames, config.survey)]
+    chosen = look.spread_out(capture.frames, config.survey)
+    names = {f.name for f in chosen}
+    others = [f for f in look.spread_out(capture.held_out, config.survey) if f.name not in names]
+    survey, left_out = ([look.view_of(field, f, config.max_pixels) for f in some] for some in (chosen, others))
     _check_knows(survey)
     views = [_placed(field, f, config) for f in frames]
-    errors = detect.errors(survey, Memory.of(field, capture.train), config.detect)
+    errors = detect.errors(survey, Memory.of(field, capture.train), config.detect, left_out)
     changed = detect.changes(views, errors, config.detect)
     shares = [float(c.mask.mean()) for c in changed]
     photos = tuple(_verdict(c.view, share, config.most_changed) for c, share in zip(changed, shares))
