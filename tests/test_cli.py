@@ -117,9 +117,10 @@ def test_evaluate_with_lpips(place, capsys):
 def believing(monkeypatch, *kinds):
     """Let the estimate say that an object of each kind changed in the middle of the scene."""
 
-    def estimate(capture, field, frames, config, on_stage=None, models=None, known=()):
+    def estimate(capture, field, frames, config, on_stage=None, models=None, known=(), on_count=None):
         for name in ("look", "decide"):
             on_stage(name)
+        on_count(1, 3)
         grid = OccupancyGrid(torch.tensor([[-0.3, -0.3, -0.3], [0.3, 0.3, 0.3]]), torch.ones(5, 5, 5))
         shift = torch.eye(4, dtype=torch.float64)
         shift[0, 3] = 0.5
@@ -269,7 +270,7 @@ def test_visits_are_listed_and_taken_back(place, monkeypatch, capsys):
 
 
 def test_no_usable_photo(place, monkeypatch, capsys):
-    def estimate(capture, field, frames, config, on_stage=None, models=None, known=()):
+    def estimate(capture, field, frames, config, on_stage=None, models=None, known=(), on_count=None):
         return SceneChange(photos=tuple(PlacedPhoto(f.name, "rejected", "98 % changed") for f in frames))
 
     monkeypatch.setattr(make, "estimate_change", estimate)
@@ -462,7 +463,7 @@ def test_photos_alone_all_the_way(reconstructed, tmp_path, monkeypatch, capsys):
     assert all(v["scores"]["psnr"] > 10 and v["scores"]["psnr_in"] is not None for v in views)
 
 
-def believe_photos(capture, field, frames, config, on_stage=None, models=None, known=()):
+def believe_photos(capture, field, frames, config, on_stage=None, models=None, known=(), on_count=None):
     """Nothing changed, and all photos were used."""
     return SceneChange(photos=tuple(PlacedPhoto(f.name, "used", frame=f) for f in frames))
 

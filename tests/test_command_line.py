@@ -133,7 +133,7 @@ def test_programs_are_told_of_visits(place, monkeypatch, capsys):  # noqa: F811
 
 
 def test_what_is_not_understood_has_its_own_code(place, monkeypatch, capsys):  # noqa: F811
-    def estimate(capture, field, frames, config, on_stage=None, models=None, known=()):
+    def estimate(capture, field, frames, config, on_stage=None, models=None, known=(), on_count=None):
         photos = tuple(PlacedPhoto(f.name, "used", "", f) for f in frames)
         return SceneChange((), photos, "who knows", unexplained=(torch.ones(24, 32, dtype=torch.bool),) * len(frames))
 

@@ -24,9 +24,14 @@ def old(tmp_path_factory):
 
 
 def estimate(old, after, folder):
-    stages = []
-    change = estimate_change(old, BEFORE, new_photos(after, folder), EstimateConfig(survey=6), stages.append)
+    stages, counts = [], []
+    change = estimate_change(
+        old, BEFORE, new_photos(after, folder), EstimateConfig(survey=6), stages.append,
+        on_count=lambda done, total: counts.append((done, total)),
+    )  # fmt: skip
     assert stages[0] == "detect"
+    assert [done for done, _ in counts] == list(range(1, len(counts) + 1))
+    assert all(done <= total for done, total in counts) and bool(counts) == ("pose" in stages)
     return change
 
 

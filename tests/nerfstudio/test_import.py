@@ -220,7 +220,7 @@ def test_a_workspace_like_any_other(run, monkeypatch, capsys):
 def _something_moved(middle: torch.Tensor):
     """An estimate that says so."""
 
-    def estimate(capture, field, frames, config, on_stage=None, models=None, known=()):
+    def estimate(capture, field, frames, config, on_stage=None, models=None, known=(), on_count=None):
         box = torch.stack([middle - 0.5, middle + 0.5])
         shift = torch.eye(4, dtype=torch.float64)
         shift[0, 3] = 1.0

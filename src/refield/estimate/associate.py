@@ -101,11 +101,12 @@ def _place(
         # what moved before moves again: a piece of something else is tried only on what that leaves unexplained
         for again in (True, False):
             some = [k for k, old in tried.items() if old.remembered == again and k not in moved and parts]
-            tries = {
-                k: fit_again(ground, everyone, views, found[k])
-                or fit_of(ground, olds[k], everyone, views, parts, guess(k))
-                for k in some
-            }
+            tries: dict[int, Fit | None] = {}
+            ground.tally.expect(len(some))
+            for k in some:
+                ground.tally.count()
+                known = fit_again(ground, everyone, views, found[k])
+                tries[k] = known or fit_of(ground, olds[k], everyone, views, parts, guess(k))
             fits |= _believed(ground, tries, cut)
             if left and not again and not any(is_certain(ground, fit) for fit in fits.values()):
                 # if any fits, only those that do: once they are off the photos nothing may be left that asks for a cut

@@ -18,6 +18,7 @@ from refield.estimate.outline import ObjectConfig
 from refield.estimate.past import Past, look_past
 from refield.estimate.pose_change import PoseChange, RefineConfig
 from refield.estimate.register import RegisterConfig
+from refield.estimate.tally import Tally
 from refield.field.radiance import Field
 from refield.scene.capture import Frame
 from refield.scene.planes import Plane
@@ -84,6 +85,8 @@ class Ground:
     search: RegisterConfig
     fine: RefineConfig
     matcher: Matcher
+    tally: Tally = dataclasses.field(default_factory=Tally)
+    """of the explanations that are tried"""
     pasts: Kept[list[Past]] = dataclasses.field(init=False, default_factory=lambda: Kept(24))
     """the photos past some objects"""
     details: Kept[Detail] = dataclasses.field(init=False, default_factory=lambda: Kept(16))

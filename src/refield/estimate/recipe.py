@@ -31,6 +31,7 @@ from refield.estimate.place import PlaceConfig, place
 from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
 from refield.estimate.settle import Search, is_piece, unexplained
+from refield.estimate.tally import OnCount, Tally
 from refield.field.radiance import Field, check_field
 from refield.field.source import Known
 from refield.scene.capture import Capture, Frame, check_capture, check_frames
@@ -106,6 +107,7 @@ def estimate_change(
     on_stage: OnStage | None = None,
     models: Models | None = None,
     known: Sequence[Known] = (),
+    on_count: OnCount | None = None,
 ) -> SceneChange:
     """What moved, left or arrived between the capture that ``field`` was fitted to and a few new photos (§4.2).
 
@@ -116,6 +118,7 @@ def estimate_change(
             those that the config names if not given.
         known: what earlier visits found, where it stood before this one: an object that moves again need not be
             segmented again (§11.3.2).
+        on_count: called with how many explanations were begun, and how many there are as far as is known.
 
     Raises:
         InputError: there is no new photo; most of the pixels changed: the photos show another scene; the field does not
@@ -149,6 +152,7 @@ def estimate_change(
     ground = Ground(
         field, hulls, up, scene.planes, scene.survey, scene.errors.memory, photographed,
         config.detect, config.hull, config.objects, config.associate, config.register, config.refine, models.matcher,
+        Tally(on_count),
     )  # fmt: skip
     search = Search(ground, scene.changed)
     settled = search.settle(olds)

@@ -94,10 +94,12 @@ class Search:
         again = True
         tried: dict[_Which, float] = {}  # beside this best one
         while again:
-            again = False
-            for this, tries in self._exchanges(best):
+            again, exchanges = False, self._exchanges(best)
+            self.ground.tally.expect(sum(this not in tried for this, _ in exchanges))
+            for this, tries in exchanges:
                 if this in tried:
                     continue
+                self.ground.tally.count()
                 others = [judged(self.ground, other) for other in tries(best)]
                 other, tried[this] = min(others, key=lambda o: o[1], default=(best, math.inf))
                 if tried[this] < least - self._worth(best, other, this):

@@ -6,9 +6,11 @@ import contextlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 from refield.estimate.localize import LocalizeConfig
+from refield.estimate.models import Models
 from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.evaluate import evaluate, looked_over
 from refield.field.radiance import Field
@@ -92,10 +94,7 @@ def make_visit(
         if config.update.route != "refield":
             need_nerfacto(old, workspace.path)
         capture = retouched(capture, old, Path(scratch))
-        known = known_objects(old)
-        change = estimate_change(
-            capture, old, frames, config.estimate, on_stage=telling.stage, models=models, known=known
-        ).among(placed)
+        change = _estimated(capture, old, frames, config.estimate, models, telling).among(placed)
         _need_a_photo(photos, change)
         new = _updated(capture, old, change, config.update, telling)
         telling.stage("report")
@@ -158,6 +157,17 @@ def _need_a_photo(photos: Path | Sequence[Frame], change: SceneChange) -> None:
         reasons = "; ".join(f"{p.name}: {p.why}" for p in change.photos)
         where = photos if isinstance(photos, Path) else "the new photos"
         raise InputError(where, f"none of the photos could be used ({reasons})", "do they show this scene?")
+
+
+def _estimated(
+    capture: Capture, old: Field, frames: Sequence[Frame], config: EstimateConfig, models: Models, telling: Telling
+) -> SceneChange:
+    with telling.counters() as counting:
+        line = cache(lambda: counting("explanations tried"))  # begun when there is something to count
+        return estimate_change(
+            capture, old, frames, config, on_stage=telling.stage, models=models, known=known_objects(old),
+            on_count=lambda done, total: line()(done, total),
+        )  # fmt: skip
 
 
 def _updated(
