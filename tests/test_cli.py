@@ -16,6 +16,7 @@ import torch
 from safetensors.torch import save_file
 
 from refield.cli import COMMANDS, main
+from refield.commands import clock
 from refield.scene.change import ObjectChange, OccupancyGrid, PlacedPhoto, SceneChange
 from refield.scene.exposure import Exposure
 from refield.scene.images import read_image, write_image
@@ -120,6 +121,7 @@ def believing(monkeypatch, *kinds):
     def estimate(capture, field, frames, config, on_stage=None, models=None, known=(), on_count=None):
         for name in ("look", "decide"):
             on_stage(name)
+        on_count(0, 3)
         on_count(1, 3)
         grid = OccupancyGrid(torch.tensor([[-0.3, -0.3, -0.3], [0.3, 0.3, 0.3]]), torch.ones(5, 5, 5))
         shift = torch.eye(4, dtype=torch.float64)
@@ -163,6 +165,15 @@ def test_nothing_changed_writes_only_the_report(place, monkeypatch, capsys):
         "look",
         "decide",
     }
+
+
+def test_how_many_explanations_were_tried_is_told_unless_it_is_to_be_quiet(place, monkeypatch, capsys):
+    believing(monkeypatch)
+    monkeypatch.setattr(clock, "_QUIET_SECONDS", -1.0)
+    assert main(["update", "work", "new"]) == 0
+    assert "explanations tried: 1 of 3" in capsys.readouterr().err
+    assert main(["update", "work", "new", "--quiet"]) == 0
+    assert "explanations" not in capsys.readouterr().err
 
 
 def test_updates_stack(place, monkeypatch, capsys):

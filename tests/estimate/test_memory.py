@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from refield.estimate import detect
+from refield.estimate import detect, recipe
 from refield.estimate.detect import DetectConfig
-from refield.estimate.look import view_of
+from refield.estimate.look import spread_out, view_of
 from refield.estimate.memory import Memory
 from refield.estimate.recipe import EstimateConfig, estimate_change
 from refield.scene.capture import Capture
@@ -132,6 +132,23 @@ def test_what_left_out_photos_show_is_chance_and_no_threshold(tmp_path):
     assert (known.levels == alone.levels).all() and (known.seeds == alone.seeds).all()
     share = [float(new.mask.mean())]
     assert alone.unusual(share) and not known.unusual(share)
+
+
+@pytest.mark.parametrize("every", [0, 3])
+def test_photos_held_out_of_the_capture_are_asked_what_chance_makes(tmp_path, every):
+    """The old photos that are held out, and only they, show a crate of another colour than the field does."""
+    other = BoxWorld(tuple(replace(box, paint=box.paint + 1) for box in OLD.boxes))
+    frames = photograph(OLD, tmp_path / "old", AROUND)
+    wrong = {f.name: f for f in photograph(other, tmp_path / "wrong", AROUND)}
+    held = {f.name for f in Capture(tuple(frames), held_out_every=every).held_out}
+    capture = Capture(tuple(wrong[f.name] if f.name in held else f for f in frames), held_out_every=every)
+    photos = photograph(other, tmp_path / "new", [camera_at(100, 30)])
+    config = EstimateConfig(survey=2)
+    errors = recipe._detected(capture, OLD, photos, config, config.models.open()).errors
+    chosen = {f.name for f in spread_out(capture.frames, 2)}
+    more = [f for f in spread_out(capture.held_out, 2) if f.name not in chosen]
+    assert len(errors.shown) == 2 and len(errors.by_chance) == 2 + len(more)
+    assert (len(more) > 0) == (every > 0) and all(share > 0.01 for share in errors.by_chance[2:])
 
 
 def test_as_much_as_chance_makes_is_not_unusual():

@@ -1,18 +1,15 @@
 from refield.estimate.tally import Tally
 
 
-def test_what_is_known_to_come_grows_and_shrinks_and_what_was_made_does_not():
+def test_what_was_made_only_grows_whatever_is_known_to_come():
     told: list[tuple[int, int]] = []
     tally = Tally(lambda done, total: told.append((done, total)))
-    tally.expect(3)
-    tally.count()
-    tally.count()
-    tally.expect(5)  # something was found, and all is asked beside that
-    tally.count()
-    tally.expect(0)
-    tally.count()
-    assert told == [(1, 3), (2, 3), (3, 7), (4, 4)]
+    tally.begin(2)
+    tally.count(1)
+    tally.count(4)  # something was found, and more is asked beside that
+    tally.count(0)
+    assert told == [(0, 2), (1, 2), (2, 6), (3, 3)]
 
 
 def test_nobody_needs_to_listen():
-    Tally().count()
+    Tally().count(1)

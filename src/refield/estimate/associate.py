@@ -102,11 +102,11 @@ def _place(
         for again in (True, False):
             some = [k for k, old in tried.items() if old.remembered == again and k not in moved and parts]
             tries: dict[int, Fit | None] = {}
-            ground.tally.expect(len(some))
+            ground.tally.begin(len(some))
             for k in some:
-                ground.tally.count()
                 known = fit_again(ground, everyone, views, found[k])
                 tries[k] = known or fit_of(ground, olds[k], everyone, views, parts, guess(k))
+                ground.tally.count(len(some) - len(tries))
             fits |= _believed(ground, tries, cut)
             if left and not again and not any(is_certain(ground, fit) for fit in fits.values()):
                 # if any fits, only those that do: once they are off the photos nothing may be left that asks for a cut

@@ -93,8 +93,8 @@ class Errors:
     seeds: Array
     """(C,) a change is larger than this somewhere"""
     by_chance: tuple[float, ...] = ()
-    """the part of each of those photos, and of others that the field did not learn from, that would be taken for
-    changed if it were new"""
+    """the part of each of those photos, and of others held out of the capture, that would be taken for changed if it
+    were new"""
 
     def unusual(self, shares: Sequence[float]) -> bool:
         """Whether new photos' changed parts are more than the field's errors make of as many photos without a change.
@@ -148,9 +148,9 @@ def noise_at(view: View, survey: Sequence[Changed]) -> Array:
 def errors(photos: Sequence[View], memory: Memory, config: DetectConfig, left_out: Sequence[View] = ()) -> Errors:
     """The field's own errors, in ``photos`` of the old state.
 
-    ``left_out``: others, that the field did not learn from, as it did not from new ones. They tell how much of such a
-    photo would be taken for changed; not what counts as a change, since where a few of them show the field wrong, true
-    changes were missed as well (docs/results.md).
+    ``left_out``: others, held out of the capture, which the field did not learn from, as it did not from new ones. They
+    tell how much of such a photo would be taken for changed; not what counts as a change, since where a few of them
+    show the field wrong, true changes were missed as well (docs/results.md).
     """
     shown, others = (tuple(_unchanged(v, config) for v in views) for views in (photos, left_out))
     of = np.concatenate([_coverage(memory.times_seen(s.view)).ravel() for s in shown])

@@ -52,7 +52,8 @@ class EstimateConfig:
     max_pixels: int = 24_000
     """photos are scaled down to this for everything but the refinement of poses"""
     survey: int = 10
-    """old photos that the field's own errors are learnt from"""
+    """old photos that the field's own errors are learnt from; and as many at most of those that are held out of the
+    capture tell how much of such a photo would be taken for changed"""
     most_changed: float = 0.5
     """if more of the photos' pixels changed, they do not show this scene"""
     place: PlaceConfig = field(default_factory=PlaceConfig)
@@ -118,7 +119,8 @@ def estimate_change(
             those that the config names if not given.
         known: what earlier visits found, where it stood before this one: an object that moves again need not be
             segmented again (§11.3.2).
-        on_count: called with how many explanations were begun, and how many there are as far as is known.
+        on_count: called with how many explanations were tried, and how many there are as far as is known; not on the
+            paper's route, which tries one.
 
     Raises:
         InputError: there is no new photo; most of the pixels changed: the photos show another scene; the field does not

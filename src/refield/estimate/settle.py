@@ -95,15 +95,15 @@ class Search:
         tried: dict[_Which, float] = {}  # beside this best one
         while again:
             again, exchanges = False, self._exchanges(best)
-            self.ground.tally.expect(sum(this not in tried for this, _ in exchanges))
-            for this, tries in exchanges:
+            self.ground.tally.begin(len(exchanges))
+            for left, (this, tries) in zip(reversed(range(len(exchanges))), exchanges):
                 if this in tried:
                     continue
-                self.ground.tally.count()
                 others = [judged(self.ground, other) for other in tries(best)]
                 other, tried[this] = min(others, key=lambda o: o[1], default=(best, math.inf))
                 if tried[this] < least - self._worth(best, other, this):
                     again, best, least, tried = True, other, tried[this], {}
+                self.ground.tally.count(left)
         if begun is not None and judged(self.ground, begun)[1] <= least:
             return begun
         return self._led(best, least, tried)

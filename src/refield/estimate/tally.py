@@ -5,23 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 
 OnCount = Callable[[int, int], None]
-"""Called with how many were made, and how many there are in all as far as is known."""
+"""Called with how many were made, and how many there are in all as far as is known: that grows with what is found, and
+shrinks where less is asked beside it."""
 
 
 class Tally:
-    """Attempts that were made, and those that are known to come."""
+    """Attempts that were made."""
 
     def __init__(self, tell: OnCount | None = None) -> None:
         self._tell = tell or (lambda done, total: None)
         self._made = 0
-        self._coming = 0
 
-    def expect(self, coming: int) -> None:
-        """So many are to come now, whatever was expected before."""
-        self._coming = coming
+    def begin(self, coming: int) -> None:
+        """So many are known to come."""
+        self._tell(self._made, self._made + coming)
 
-    def count(self) -> None:
-        """One more was made."""
+    def count(self, coming: int) -> None:
+        """One more was made, and so many are known to come."""
         self._made += 1
-        self._coming = max(self._coming - 1, 0)
-        self._tell(self._made, self._made + self._coming)
+        self.begin(coming)
