@@ -14,6 +14,7 @@ from refield.estimate.fit import Fit
 from refield.estimate.ground import AssociateConfig
 from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
+from refield.estimate.tally import Tally
 
 A, B, C = 0, 1, 2
 CERTAIN, WEAK, NOWHERE = 0.9, 0.6, None
@@ -51,7 +52,7 @@ def asked_to_be_cut(monkeypatch, wholes, left=("a newcomer",), remembered=()):
         "_together": place,
     }.items():
         monkeypatch.setattr(associate, name, stand_in)
-    ground = SimpleNamespace(believe=AssociateConfig(), search=RegisterConfig(), survey=(), matcher=None)
+    ground = SimpleNamespace(believe=AssociateConfig(), search=RegisterConfig(), survey=(), matcher=None, tally=Tally())
     with suppress(Placed):
         associate._place(ground, olds, list(olds), [], (count(9), {k: [] for k in olds}))
     return asked

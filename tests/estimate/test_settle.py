@@ -15,6 +15,7 @@ from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of
 from refield.estimate.models import Models
 from refield.estimate.outline import as_one, restricted
+from refield.estimate.tally import Tally
 from refield.scene.pose import angle_between, transform
 from refield.scene.srgb import to_linear, to_srgb
 from refield.vision import pixels
@@ -470,4 +471,4 @@ def test_more_objects_are_taken_only_where_they_leave_less_unexplained(monkeypat
     monkeypatch.setattr(settle, "judged", lambda ground, one: (one, 10.0 if one is begun else left))
     monkeypatch.setattr(settle.Search, "_placed", lambda self, olds, before: more)
     monkeypatch.setattr(settle.Search, "_exchanges", lambda self, best: [])
-    assert (settle.Search(None, []).settle([], begun).touched == (1,)) is taken
+    assert (settle.Search(SimpleNamespace(tally=Tally()), []).settle([], begun).touched == (1,)) is taken
