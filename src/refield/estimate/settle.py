@@ -95,15 +95,15 @@ class Search:
         tried: dict[_Which, float] = {}  # beside this best one
         while again:
             again, exchanges = False, self._exchanges(best)
-            self.ground.tally.begin(len(exchanges))
-            for left, (this, tries) in zip(reversed(range(len(exchanges))), exchanges):
+            self.ground.tally.begin(sum(this not in tried for this, _ in exchanges))
+            for k, (this, tries) in enumerate(exchanges, start=1):
                 if this in tried:
                     continue
                 others = [judged(self.ground, other) for other in tries(best)]
                 other, tried[this] = min(others, key=lambda o: o[1], default=(best, math.inf))
                 if tried[this] < least - self._worth(best, other, this):
                     again, best, least, tried = True, other, tried[this], {}
-                self.ground.tally.count(left)
+                self.ground.tally.count(sum(that not in tried for that, _ in exchanges[k:]))
         if begun is not None and judged(self.ground, begun)[1] <= least:
             return begun
         return self._led(best, least, tried)
