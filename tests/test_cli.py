@@ -43,6 +43,28 @@ def test_help_is_light_and_names_every_command():
     assert done.returncode == 0 and all(name in done.stdout for name in COMMANDS)
 
 
+@pytest.mark.parametrize(
+    "given, spin, blas",
+    [
+        ({}, "1000", "1"),
+        ({"GOMP_SPINCOUNT": "7", "OPENBLAS_NUM_THREADS": "3"}, "7", "3"),
+        ({"OMP_WAIT_POLICY": "active"}, None, "1"),
+    ],
+)
+def test_threads_are_told_how_to_wait_before_they_are_made_unless_the_user_did(given, spin, blas):
+    names = ("GOMP_SPINCOUNT", "OPENBLAS_NUM_THREADS")
+    code = f"""
+import os, sys
+from refield.cli import main
+main(["--version"])
+assert not {{"numpy", "scipy", "numba", "torch"}} & {{*sys.modules}}
+print([os.environ.get(name) for name in {names}])
+"""
+    bare = {name: value for name, value in HERE.items() if name not in (*names, "OMP_WAIT_POLICY")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=bare | given, check=True)
+    assert done.stdout.splitlines()[-1] == str([spin, blas])
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command, capsys):
     with pytest.raises(SystemExit) as caught:

@@ -125,6 +125,7 @@ def test_what_was_found_is_shown(
     docs.parent.mkdir()
     docs.write_text("# Results\n\nOther figures.\n")
     argv = ["paper_tables.py", "--only", "table3", "--folders", str(mine), "--out", str(tmp_path / "out")]
+    argv += ["--threads", str(torch.get_num_threads())]  # which the script sets for its whole process
     monkeypatch.setattr(sys, "argv", [*argv, "--docs", str(docs)])
     assert script.main() == 0
     assert "0 runs are missing" in capsys.readouterr().out

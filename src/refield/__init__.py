@@ -43,6 +43,7 @@ files and axes are described in docs/conventions.md.
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 # There is no __all__: with one, help(refield) would print every class in full. Type checkers take "name as name" for
@@ -101,3 +102,16 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted([*_MODULE_OF, "__doc__", "__version__"])
+
+
+def _wait_calmly() -> None:
+    """Have threads that wait for the others sleep soon, so that what runs beside them is not held up, nor they by it.
+
+    GNU's OpenMP, which torch and numba share on Linux, reads this when it is loaded. By itself a thread spins 300,000
+    times, and 1,000 times where there are more threads than cores; but it knows of those of its own process only.
+    """
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+
+
+_wait_calmly()
