@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from refield.estimate import associate
+from refield.estimate import associate, recipe
 from refield.estimate.detect import Changed
 from refield.estimate.hull import HullConfig, carve, find_regions
 from refield.estimate.lattice import Lattice, components
 from refield.estimate.look import median_depth, view_of
 from refield.field.volrend import Samples
-from refield.scene.planes import EXACT, Plane, _edges, rough_planes, support_planes, support_tops
+from refield.scene.planes import EXACT, Plane, _edges, holds_up, rough_planes, support_planes, support_tops
 from tests.estimate.boxes import BoxWorld, camera_at, photograph, standing
 
 CRATE = standing((0.2, 0.17, 0.18), -0.1, -0.1, 20)
@@ -160,6 +160,31 @@ def test_what_moved_holds_nothing_up():
     still = points[:, 2] < 0.5
     for rough in (1, 2, 4):
         assert not any(p.offset > 0.5 for p in support_tops(points, eyes, still, rough * EXACT * 0.012))
+
+
+def test_what_is_behind_the_side_of_a_thing_does_not_stand_on_it():
+    """The side of a cupboard that stayed is as even, and ends, as the top of a table does."""
+    points, eyes = table_and_floor()
+    everything = np.ones(len(points), bool)
+    top = next(p for p in support_tops(points, eyes, everything, EXACT * 0.012) if p.offset > 0.5)
+    box = np.random.default_rng(1).uniform([-0.1, -0.1, 0.7], [0.1, 0.1, 0.9], (500, 3)).astype(np.float32)
+    tol = EXACT * 0.012
+    assert holds_up(top, box, tol)
+    assert not holds_up(top, box - np.float32([0, 0, 0.3]), tol)
+    assert holds_up(top, box + np.float32([2, 0, -0.3]), tol)  # of what is beside it nothing is known
+    assert holds_up(top, np.concatenate([box, box[:400] - np.float32([0, 0, 0.3])]), tol)
+    on_top = np.concatenate([points[points[:, 2] > 0.5][:600], box[:500] - np.float32([0, 0, 0.3])])
+    assert holds_up(top, on_top, tol)
+
+
+def test_only_planes_that_hold_up_what_changed_count(monkeypatch, views):
+    floor, above = (Plane(np.float32([0, 0, 1]), height, 0.003) for height in (0.0, 1.5))
+    blank = np.zeros(views[0].shape)
+    changed = [Changed(v, blank, blank, true_mask(v), *np.zeros((2, *v.shape), bool)) for v in views]
+    for sought, others in (("support_planes", "support_tops"), ("support_tops", "support_planes")):
+        monkeypatch.setattr(recipe, sought, lambda *_: [above, floor])
+        monkeypatch.setattr(recipe, others, lambda *_: [])
+        assert recipe._planes(views, changed) == [floor]
 
 
 def test_a_slice_of_what_fills_space_is_no_plane():

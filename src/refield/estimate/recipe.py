@@ -37,7 +37,7 @@ from refield.field.source import Known
 from refield.scene.capture import Capture, Frame, check_capture, check_frames
 from refield.scene.change import PlacedPhoto, SceneChange
 from refield.scene.errors import InputError
-from refield.scene.planes import EXACT, Plane, support_planes, support_tops
+from refield.scene.planes import EXACT, Plane, holds_up, support_planes, support_tops
 
 OnStage = Callable[[str], None]
 _MUCH_NEW = 0.02  # of a photo's pixels, from which on it is said that no old photo saw what they show
@@ -254,8 +254,8 @@ def _never_seen(changed: Sequence[Changed]) -> str:
 
 
 def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
-    """What holds things up around the changed pixels, and stayed, if the field shows it exactly: through a surface that
-    is uneven there are planes that hold parts of what stands on it, too."""
+    """What holds up what changed, and stayed, if the field shows it exactly: through a surface that is uneven there are
+    planes that hold parts of what stands on it, too."""
     near = np.concatenate([c.view.surface[c.mask & np.isfinite(c.view.depth)] for c in changed])
     points = np.concatenate([v.surface.reshape(-1, 3) for v in survey])
     eyes = np.repeat([v.centre for v in survey], [v.depth.size for v in survey], 0)
@@ -269,7 +269,8 @@ def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
     sizes = [float(np.median(d)) * v.pixel_angle for v, d in depths if len(d)]
     points, eyes, exact = points[some], eyes[some], EXACT * float(np.median(sizes))
     endless = support_planes(points, np.stack([v.centre for v in survey]), exact)
-    return endless or support_tops(points, eyes, _still(points, changed), exact)
+    planes = endless or support_tops(points, eyes, _still(points, changed), exact)
+    return [p for p in planes if holds_up(p, near, exact)]
 
 
 def _still(points: Array, changed: Sequence[Changed]) -> Mask:

@@ -91,6 +91,17 @@ def support_tops(points: Array, eyes: Array, still: NDArray[np.bool_], tol: floa
     return [_ended(p, points, tol) for p in found]
 
 
+def holds_up(plane: Plane, surfaces: Array, tol: float) -> bool:
+    """Whether surfaces (N, 3) are on a plane and before it rather than beneath it.
+
+    Asked of what changed: the side of a large thing that stayed is a plane that stayed, too, and what is behind that
+    does not stand on it.
+    """
+    height = plane.above(surfaces)
+    beneath = height < -2.5 * tol
+    return bool(beneath.sum() <= (np.isfinite(height) & ~beneath).sum())
+
+
 def _ended(plane: Plane, points: Array, tol: float) -> Plane:
     """The plane as far as its points reach, and as uneven as they are around it."""
     on = points[np.abs(plane.height(points)) < tol]
