@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from refield.estimate import recipe, settle
+from refield.estimate import comoving, recipe, settle
 from refield.estimate.associate import without
 from refield.estimate.comoving import with_comoving
 from refield.estimate.fit import rest_of
@@ -65,6 +65,20 @@ def test_an_outline_grows_to_all_that_went_along(tmp_path, monkeypatch, moved, p
     share, own = held(grown, CRATE)
     assert share > 0.85 and own > 0.9
     assert held(grown, DRUM)[0] < 0.15
+
+
+def test_what_reaches_the_end_of_what_was_asked_is_asked_for_further(tmp_path, monkeypatch):
+    ground, olds, changed = begun(tmp_path, monkeypatch, BoxWorld((CRATE.moved(AWAY), DRUM)))
+    whole = max(olds, key=lambda o: held(o, CRATE)[0])
+    x, _, z = np.moveaxis(whole.lattice.centres, -1, 0)
+    far = [at > np.quantile(at[whole.voxels], 0.7) for at in (x, z)]
+    corner = restricted(whole, whole.voxels & far[0] & far[1], ground.shape)
+    past = without(ground, changed, [corner])
+    grown = with_comoving(ground, corner, past, AWAY)
+    share, own = held(grown, CRATE)
+    assert share > 0.85 and own > 0.9 and held(grown, DRUM)[0] < 0.15
+    monkeypatch.setattr(comoving, "_TIMES", 1)
+    assert held(with_comoving(ground, corner, past, AWAY), CRATE)[0] < 0.7
 
 
 def test_what_changed_by_itself_is_no_part_of_another(tmp_path, monkeypatch):

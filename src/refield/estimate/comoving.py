@@ -38,6 +38,7 @@ from refield.scene.srgb import to_linear, to_srgb
 from refield.vision import pixels
 
 _AROUND = 0.5  # of an object's longest side, on every side of it, is asked whether it went along
+_TIMES = 3  # that is asked, of what is found to reach further; each reaches twice as far as the one before
 _POINTS = 4000  # on all surfaces there
 _SEEN = 2  # old pixels that must show a surface in a voxel
 _UNKNOWN = 0.6  # what a photo costs that shows what nobody knew
@@ -61,23 +62,41 @@ def with_comoving(
 ) -> Old | None:
     """The object as all that went along with it from where it was; None if next to nothing did.
 
+    Where that reaches the end of what was asked, what is around that is asked next.
+
     Args:
         past: the new photos, without what left and with what was placed before taken off.
         new_from_old: the pose change (4, 4); None if it left.
         others: what has a change of its own, and is no part of it.
     """
+    along, asked = None, old
+    for _ in range(_TIMES):
+        found, ends = _along(ground, asked, past, new_from_old, others)
+        if found is None:
+            break
+        along = found
+        if ends or found.volume <= asked.volume:
+            break
+        asked = found
+    return along
+
+
+def _along(
+    ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor | None, others: Sequence[Old]
+) -> tuple[Old | None, bool]:
+    """What around an object went along with it, and whether that ends within what was asked."""
     places = old.lattice.centres[old.voxels]
     low, high = places.min(0), places.max(0)
     pad = _AROUND * float((high - low).max())
     low, high = low - pad, high + pad
     patches = look_around(ground.field, ground.photographed, corners_of(low, high), ground.shape.rays)
     if not patches:
-        return None
+        return None, True
     lattice = Lattice.over(low, high, ground.shape.longest)
     free = free_voxels(lattice, ground.planes)
     cloud, held = _surfaces(lattice, free, patches)
     if len(cloud.points) < FEWEST_POINTS:
-        return None
+        return None, True
     solid = carve_solid(lattice, patches, ground.shape.through, float((high - low).max())) & free | held
     asked = _asked(ground, old, cloud, past, new_from_old)
     likely = _walked(alike(cloud), asked)
@@ -89,8 +108,10 @@ def with_comoving(
     before = old.lattice.holds(old.voxels, lattice.centres)
     parts = [p for p in components(voxels, FEWEST_POINTS) if (p & before).any()]
     if not parts:
-        return None
-    return seen_as(lattice, max(parts, key=lambda p: (p & before).sum()), free, patches, ground.planes, ground.shape)
+        return None, True
+    part = max(parts, key=lambda p: (p & before).sum())
+    ends = not any(part.take(k, axis).any() for axis in range(3) for k in (0, -1))
+    return seen_as(lattice, part, free, patches, ground.planes, ground.shape), ends
 
 
 def _surfaces(lattice: Lattice, free: Voxels, patches: Sequence[Patch]) -> tuple[Cloud, Voxels]:
