@@ -107,8 +107,9 @@ def __dir__() -> list[str]:
 def _wait_calmly() -> None:
     """Have threads that wait for the others sleep soon, so that what runs beside them is not held up, nor they by it.
 
-    GNU's OpenMP, which torch and numba share on Linux, reads this when it is loaded. By itself a thread spins 300,000
-    times, and 1,000 times where there are more threads than cores; but it knows of those of its own process only.
+    GNU's OpenMP, of which torch and numba each load one on Linux, reads this when it is loaded. By itself a thread
+    spins 300,000 times, and far less where there are more threads than cores; but it knows of those of its own process
+    only.
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", "1000")

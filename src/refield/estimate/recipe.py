@@ -269,8 +269,9 @@ def _planes(survey: Sequence[View], changed: Sequence[Changed]) -> list[Plane]:
     sizes = [float(np.median(d)) * v.pixel_angle for v, d in depths if len(d)]
     points, eyes, exact = points[some], eyes[some], EXACT * float(np.median(sizes))
     endless = support_planes(points, np.stack([v.centre for v in survey]), exact)
-    planes = endless or support_tops(points, eyes, _still(points, changed), exact)
-    return [p for p in planes if holds_up(p, near, exact)]
+    endless = [p for p in endless if holds_up(p, near, exact)]
+    tops = [] if endless else support_tops(points, eyes, _still(points, changed), exact)
+    return endless or [p for p in tops if holds_up(p, near, exact)]
 
 
 def _still(points: Array, changed: Sequence[Changed]) -> Mask:
