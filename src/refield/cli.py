@@ -43,7 +43,7 @@ _DISK = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM, errno.EDQUOT)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    # numpy's and scipy's products are small here: more threads gain nothing, and spin where another program runs
+    # numpy's and scipy's products are small here: more threads hardly gain, and spin where another program runs
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -185,6 +185,8 @@ def test_only_planes_that_hold_up_what_changed_count(monkeypatch, views):
         monkeypatch.setattr(recipe, sought, lambda *_: [above, floor])
         monkeypatch.setattr(recipe, others, lambda *_: [])
         assert recipe._planes(views, changed) == [floor]
+    monkeypatch.setattr(recipe, "support_planes", lambda *_: [above])  # which is no reason to look for no others
+    assert recipe._planes(views, changed) == [floor]
 
 
 def test_a_slice_of_what_fills_space_is_no_plane():

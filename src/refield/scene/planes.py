@@ -18,6 +18,7 @@ _FEWEST = 50  # points
 _PART = 0.12  # of all points that a plane holds at least
 _FEW = 0.03  # of all points that may lie where they could not be seen, if it were one
 _PEAK = 0.4  # of as many as a plane holds may be within as much again of it: of what fills space it is half, or all
+_OFF = 2.5  # tolerances from a plane, from which on a point is not on it
 _DEVIATION = 1.48  # times the median absolute deviation
 _CORNERS = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
 _BESIDE = 3.0  # times the distance from point to point; further apart they are of two pieces
@@ -57,7 +58,7 @@ def support_planes(points: Array, cameras: Array, tol: float) -> list[Plane]:
     """Planes that hold up what stands on them: many points on it, hardly any behind, the cameras in front."""
 
     def possible(plane: Plane) -> bool:
-        return (plane.height(points) < -2.5 * tol).mean() < _FEW and bool((plane.height(cameras) > 0).all())
+        return (plane.height(points) < -_OFF * tol).mean() < _FEW and bool((plane.height(cameras) > 0).all())
 
     return _planes(points, cameras, tol, possible)
 
@@ -81,7 +82,7 @@ def support_tops(points: Array, eyes: Array, still: NDArray[np.bool_], tol: floa
             return False
         if (before[on] <= 0).mean() > _FEW:
             return False
-        through = np.flatnonzero((height < -2.5 * tol) & (before > 0) | (before < 0) & (height > 2.5 * tol))
+        through = np.flatnonzero((height < -_OFF * tol) & (before > 0) | (before < 0) & (height > _OFF * tol))
         part = (before[through] / (before[through] - height[through]))[:, None]
         met = eyes[through] + part * (points[through] - eyes[through])
         beside = cKDTree(points[on]).query(met, distance_upper_bound=_apart(points[on]))[0]
@@ -98,7 +99,7 @@ def holds_up(plane: Plane, surfaces: Array, tol: float) -> bool:
     does not stand on it.
     """
     height = plane.above(surfaces)
-    beneath = height < -2.5 * tol
+    beneath = height < -_OFF * tol
     return bool(beneath.sum() <= (np.isfinite(height) & ~beneath).sum())
 
 
@@ -138,7 +139,7 @@ def _planes(points: Array, eyes: Array, tol: float, possible: Callable[[Plane], 
         if plane is None:
             break
         planes.append(plane)
-        rest = rest[np.abs(plane.height(rest)) >= 2.5 * tol]
+        rest = rest[np.abs(plane.height(rest)) >= _OFF * tol]
     return planes
 
 
