@@ -25,7 +25,7 @@ from refield.estimate.look import Hidden, see, shaded
 from refield.estimate.matched import camera_from_object, matched_poses
 from refield.estimate.models import Models
 from refield.estimate.outline import ObjectConfig, remembered
-from refield.estimate.past import changed_share, gone_score, look_past, silhouette
+from refield.estimate.past import _around, changed_share, gone_score, look_past, silhouette
 from refield.estimate.pose_change import COARSEST, FINER, SIDE, RefineConfig, refine, residuals
 from refield.estimate.register import RegisterConfig, Target, register, super_fibonacci, turns_about
 from refield.estimate.rotations import best_rotations, may_be_turned
@@ -102,6 +102,40 @@ def test_photos_that_would_look_the_same_without_it_are_not_asked(stage):
         assert changed_share(past, stage.old) > 0.7
         share, asked = gone_score(past, stage.old)
         assert share > 0.5 and asked > 50
+
+
+def test_what_nobody_saw_the_place_of_is_gone_where_that_looks_like_what_is_around(stage):
+    """As of what lies flat: all that is behind it is what it lies on."""
+    nobody = SimpleNamespace(times_seen=lambda view, depth, where: np.zeros(view.shape, int))
+    config = stage.scene.config
+
+    def past(changed):
+        return look_past(BEFORE, changed, nobody, [stage.old], (config.detect, config.hull))
+
+    known = past(stage.scene.changed)
+    assert not any((p.was & p.known).any() for p in known)
+    share, asked = gone_score(known, stage.old)
+    assert share > 0.5 and asked > 50
+    other = []
+    for c in stage.scene.changed:  # another thing stands there
+        photo = c.view.photo.copy()
+        photo[silhouette(c.view, stage.old)] = (0.1, 0.9, 0.9)
+        other.append(replace(c, view=replace(c.view, photo=photo)))
+    assert gone_score(past(other), stage.old)[0] < 0.1
+    stayed = [replace(c, mask=np.zeros_like(c.mask)) for c in stage.scene.changed]
+    assert gone_score(past(stayed), stage.old)[0] == 0
+
+
+def test_what_is_around_is_asked_of_the_nearest_unchanged_pixels():
+    unknown, unchanged = np.zeros((2, 50, 50), bool)
+    unknown[10:14, 10:14], unchanged[10:14, 16:30], unchanged[40:] = True, True, True
+    lab = np.full((50, 50, 3), 50.0, np.float32)
+    lab[:, 24:30] = lab[40:] = 80  # farther than as many pixels as are asked
+    apart = _around(lab, unknown, unchanged)
+    assert np.isinf(apart[~unknown]).all() and (apart[unknown] == 0).all()
+    lab[10:14, 10:14] = 80
+    assert (_around(lab, unknown, unchanged)[unknown] > 50).all()
+    assert np.isinf(_around(lab, unknown, np.zeros_like(unknown))).all()
 
 
 def test_looking_past_it_heeds_how_near_to_a_surface_is_on_it(stage):

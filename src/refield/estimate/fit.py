@@ -22,7 +22,7 @@ from refield.estimate.layers import Sight, layers_at
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import FEWEST_POINTS, restricted
-from refield.estimate.past import Past, gone_score, silhouette
+from refield.estimate.past import FEWEST_ASKED, Past, gone_score, silhouette
 from refield.estimate.pose_change import COARSEST, FINER, SIDE, PoseChange, refine, shared_out
 from refield.estimate.register import Candidate, Target, register
 from refield.estimate.split import halves
@@ -203,7 +203,7 @@ def _part_of(
 def left_by(ground: Ground, past: Sequence[Past], old: Old) -> float | None:
     """Part of an object's pixels that show what was behind it; None if they are too few to say that it left."""
     share, asked = gone_score(past, old)
-    return share if share >= ground.believe.gone and asked >= 12 else None
+    return share if share >= ground.believe.gone and asked >= FEWEST_ASKED else None
 
 
 def best_fit(

@@ -14,8 +14,10 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
+from scipy import ndimage
+from scipy.spatial import cKDTree
 
-from refield.estimate.detect import Changed, DetectConfig, Mask, difference
+from refield.estimate.detect import Changed, DetectConfig, Mask, blur_sigma, difference
 from refield.estimate.hull import HullConfig, tolerance
 from refield.estimate.lattice import grown
 from refield.estimate.look import Array, Hidden, View, see
@@ -23,6 +25,9 @@ from refield.estimate.memory import Memory
 from refield.estimate.objects import Old
 from refield.field.radiance import Field
 from refield.vision import pixels
+
+FEWEST_ASKED = 12
+"""pixels from which it is said that an object left"""
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,8 @@ class Past:
     """as ``depth``, without the objects that were placed since"""
     telling: Mask
     """pixels that would show that what was taken out is gone: they look otherwise without it, as far as anyone knows"""
+    sigma: float
+    """pixels by which the photo is blurred where its colours are compared"""
 
     @property
     def view(self) -> View:
@@ -55,6 +62,14 @@ class Past:
     def asked(self) -> Mask:
         """Pixels that speak of bodies: not of what no old photo saw, nor of light alone on what stayed."""
         return ~self.changed.new & ~(self.changed.light & ~self.was)
+
+    @cached_property
+    def around(self) -> Array:
+        """(H, W) where nobody knows what is behind: Lab difference of the photo and whichever of the unchanged pixels
+        around is most alike; inf elsewhere."""
+        unchanged = ~(self.was | self.covered | self.changed.mask | self.changed.new)
+        lab = pixels.to_lab(pixels.blur(self.view.photo, self.sigma))
+        return _around(lab, self.was & ~self.known, unchanged)
 
     @cached_property
     def explained(self) -> Mask:
@@ -104,7 +119,23 @@ def _look_past(
     known = ~pixels.dilate(pixels.close(guess, 3), 1)
     telling = ~known | (difference(replace(view, photo=view.rgb), rgb, config) > c.threshold)
     diff = difference(view, rgb, config)
-    return Past(c, rgb, depth, gone, known, diff, np.zeros(view.shape, bool), depth, telling)
+    sigma = blur_sigma(view, config)
+    return Past(c, rgb, depth, gone, known, diff, np.zeros(view.shape, bool), depth, telling, sigma)
+
+
+def _around(lab: Array, unknown: Mask, unchanged: Mask) -> Array:
+    """(H, W) how far colours (H, W, 3) are from those of the unchanged pixels that are nearest to what is unknown, as
+    many as that has, by the one most alike; inf where it is known.
+
+    What a thing stood on goes on around it: nobody saw it there, and yet a photo may look like it.
+    """
+    out = np.full(unknown.shape, np.inf, np.float32)
+    if not unknown.any() or not unchanged.any():
+        return out
+    away = np.where(unchanged, ndimage.distance_transform_edt(~unknown), np.inf).ravel()
+    nearest = np.argsort(away, kind="stable")[: min(int(unknown.sum()), int(unchanged.sum()))]
+    out[unknown] = cKDTree(lab.reshape(-1, 3)[nearest]).query(lab[unknown])[0]
+    return out
 
 
 def _beneath(view: View, depth: Array, olds: Sequence[Old], where: Mask) -> Mask:
@@ -127,16 +158,21 @@ def silhouette(view: View, old: Old) -> Mask:
 
 
 def gone_score(past: Sequence[Past], old: Old) -> tuple[float, int]:
-    """How much better the photos agree with what is behind than with the object: (part of known pixels, pixels).
+    """How much better the photos agree with what is behind than with the object: (part of the pixels asked, pixels).
 
     Only pixels are asked that show the object in the old field, whose background is known and looks otherwise, and
-    before which no object that was placed stands.
+    before which no object that was placed stands. Where there are next to none, as of what lies flat, those are asked
+    whose background nobody knows: whether they look like what is around.
     """
-    better, asked = 0, 0
-    for p in past:
-        here = silhouette(p.view, old) & p.was & p.known & p.telling & ~p.covered
-        asked += int(here.sum())
-        better += int((here & (p.difference < 0.7 * p.changed.difference) & p.changed.mask).sum())
+    for known in (True, False):
+        better, asked = 0, 0
+        for p in past:
+            here = silhouette(p.view, old) & p.was & (p.known == known) & p.telling & ~p.covered
+            asked += int(here.sum())
+            alike = p.difference < 0.7 * p.changed.difference if known else p.around < p.changed.threshold
+            better += int((here & alike & p.changed.mask).sum())
+        if asked >= FEWEST_ASKED:
+            break
     return (better / asked if asked else 0.0), asked
 
 
