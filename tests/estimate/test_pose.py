@@ -114,8 +114,8 @@ def test_what_nobody_saw_the_place_of_is_gone_where_that_looks_like_what_is_arou
 
     known = past(stage.scene.changed)
     assert not any((p.was & p.known).any() for p in known)
-    share, asked = gone_score(known, stage.old)
-    assert share > 0.5 and asked > 50
+    assert left_by(SimpleNamespace(believe=AssociateConfig()), known, stage.old) is not None
+    assert gone_score(known, stage.old)[1] > 50
     other = []
     for c in stage.scene.changed:  # another thing stands there
         photo = c.view.photo.copy()
