@@ -23,7 +23,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refield.estimate.alone import object_alone
-from refield.estimate.detect import blur_sigma
 from refield.estimate.explain import LIMIT
 from refield.estimate.ground import Ground
 from refield.estimate.lattice import Lattice, Voxels, components
@@ -170,8 +169,6 @@ class _Shown:
     """A new photo beside the hypothesis that an object moved."""
 
     past: Past
-    lab: Array
-    """(H, W, 3) the photo"""
     alone: Array
     """(H, W) depth of the moved object; inf where it is not"""
     front: Array
@@ -180,7 +177,6 @@ class _Shown:
     """(H, W) what it costs to show the old field as it was"""
     behind: Array
     """(H, W) what it costs to show what was behind what left"""
-    sigma: float
 
     @staticmethod
     def of(ground: Ground, old: Old, p: Past, pose: Tensor | None) -> _Shown:
@@ -197,8 +193,7 @@ class _Shown:
         before = np.where(even, np.minimum(before, _LIT), before)
         behind = np.where(p.known, np.minimum((p.difference / wrong) ** 2, 1), _UNKNOWN)
         behind = np.where(p.changed.new, _UNKNOWN, behind)
-        sigma = blur_sigma(view, ground.detect)
-        return _Shown(p, pixels.to_lab(pixels.blur(view.photo, sigma)), depth, front, before, behind, sigma)
+        return _Shown(p, depth, front, before, behind)
 
     def where_it_was(self, cloud: Cloud, covered: Array) -> tuple[Array, Array]:
         """What it costs if the points stayed, and if they went, by what the photo shows where they were.
@@ -240,7 +235,7 @@ class _Shown:
         for step in itertools.product((-1, 0, 1), repeat=2):
             at = uv + np.array(step)
             ok = inside & (at >= 0).all(-1) & (at < view.shape[::-1]).all(-1)
-            far = np.linalg.norm(view.lookup(self.lab, at, ok) - own, axis=-1)
+            far = np.linalg.norm(view.lookup(p.lab, at, ok) - own, axis=-1)
             apart = np.where(ok, np.minimum(apart, far), apart)
         wrong = LIMIT**2 * view.lookup(p.changed.threshold, uv, inside)
         went = np.minimum((apart / wrong) ** 2, 1)
@@ -260,7 +255,7 @@ def _light(cloud: Cloud, old: Old, now: Array, facing: Array, shown: Sequence[_S
         view = s.past.view
         uv, inside, seen = s.would_show(now, facing)
         use = own & seen
-        photo = to_linear(view.lookup(pixels.blur(view.photo, s.sigma), uv, inside)[use])
+        photo = to_linear(view.lookup(pixels.blur(view.photo, s.past.sigma), uv, inside)[use])
         ratio = np.log((photo + DARK / 3) / (to_linear(cloud.colours[use]) + DARK / 3))
         rows.append(facing[use])
         logs.append(ratio)

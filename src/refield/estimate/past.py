@@ -27,7 +27,7 @@ from refield.field.radiance import Field
 from refield.vision import pixels
 
 FEWEST_ASKED = 12
-"""pixels from which it is said that an object left"""
+"""pixels from which a part of them says whether an object is gone"""
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,16 @@ class Past:
         return ~self.changed.new & ~(self.changed.light & ~self.was)
 
     @cached_property
+    def lab(self) -> Array:
+        """(H, W, 3) the photo's colours as they are compared."""
+        return pixels.to_lab(pixels.blur(self.view.photo, self.sigma))
+
+    @cached_property
     def around(self) -> Array:
         """(H, W) where nobody knows what is behind: Lab difference of the photo and whichever of the unchanged pixels
         around is most alike; inf elsewhere."""
         unchanged = ~(self.was | self.covered | self.changed.mask | self.changed.new)
-        lab = pixels.to_lab(pixels.blur(self.view.photo, self.sigma))
-        return _around(lab, self.was & ~self.known, unchanged)
+        return _around(self.lab, self.was & ~self.known, unchanged)
 
     @cached_property
     def explained(self) -> Mask:
@@ -132,9 +136,8 @@ def _around(lab: Array, unknown: Mask, unchanged: Mask) -> Array:
     out = np.full(unknown.shape, np.inf, np.float32)
     if not unknown.any() or not unchanged.any():
         return out
-    away = np.where(unchanged, ndimage.distance_transform_edt(~unknown), np.inf).ravel()
-    nearest = np.argsort(away, kind="stable")[: min(int(unknown.sum()), int(unchanged.sum()))]
-    out[unknown] = cKDTree(lab.reshape(-1, 3)[nearest]).query(lab[unknown])[0]
+    nearest = np.argsort(ndimage.distance_transform_edt(~unknown)[unchanged], kind="stable")[: unknown.sum()]
+    out[unknown] = cKDTree(lab[unchanged][nearest]).query(lab[unknown])[0]
     return out
 
 
@@ -164,15 +167,16 @@ def gone_score(past: Sequence[Past], old: Old) -> tuple[float, int]:
     before which no object that was placed stands. Where there are next to none, as of what lies flat, those are asked
     whose background nobody knows: whether they look like what is around.
     """
-    for known in (True, False):
-        better, asked = 0, 0
-        for p in past:
-            here = silhouette(p.view, old) & p.was & (p.known == known) & p.telling & ~p.covered
-            asked += int(here.sum())
-            alike = p.difference < 0.7 * p.changed.difference if known else p.around < p.changed.threshold
-            better += int((here & alike & p.changed.mask).sum())
-        if asked >= FEWEST_ASKED:
-            break
+    shown = [silhouette(p.view, old) & p.was & p.telling & ~p.covered for p in past]
+    asked = sum(int((s & p.known).sum()) for s, p in zip(shown, past))
+    if asked >= FEWEST_ASKED:
+        here = [s & p.known for s, p in zip(shown, past)]
+        alike = [p.difference < 0.7 * p.changed.difference for p in past]
+    else:
+        here = [s & ~p.known for s, p in zip(shown, past)]
+        alike = [p.around < p.changed.threshold for p in past]
+        asked = sum(int(h.sum()) for h in here)
+    better = sum(int((h & a & p.changed.mask).sum()) for h, a, p in zip(here, alike, past))
     return (better / asked if asked else 0.0), asked
 
 
@@ -188,4 +192,4 @@ def changed_share(past: Sequence[Past], old: Old) -> float:
         here = silhouette(p.view, old) & p.telling
         shown += int(here.sum())
         touched += int((here & p.changed.certain).sum())
-    return touched / shown if touched >= 12 else 0.0
+    return touched / shown if touched >= FEWEST_ASKED else 0.0
