@@ -12,7 +12,7 @@ from scipy import ndimage
 from refield.estimate import recipe, rotations
 from refield.estimate.alone import object_alone
 from refield.estimate.associate import take_off
-from refield.estimate.conclude import _shown_in
+from refield.estimate.conclude import Told, _shown_in, concluded
 from refield.estimate.detail import detail_of, looking_alike
 from refield.estimate.explain import explained_before
 from refield.estimate.faces import changed_parts
@@ -21,11 +21,12 @@ from refield.estimate.ground import AssociateConfig
 from refield.estimate.hull import HullConfig
 from refield.estimate.kept import Kept
 from refield.estimate.layers import Sight, layers_at
+from refield.estimate.likelihood import Settled
 from refield.estimate.look import Hidden, see, shaded
 from refield.estimate.matched import camera_from_object, matched_poses
 from refield.estimate.models import Models
 from refield.estimate.outline import ObjectConfig, remembered
-from refield.estimate.past import _around, changed_share, gone_score, look_past, silhouette
+from refield.estimate.past import _around, background_seen, changed_share, gone_score, look_past, silhouette
 from refield.estimate.pose_change import COARSEST, FINER, SIDE, RefineConfig, refine, residuals
 from refield.estimate.register import RegisterConfig, Target, register, super_fibonacci, turns_about
 from refield.estimate.rotations import best_rotations, may_be_turned
@@ -116,6 +117,11 @@ def test_what_nobody_saw_the_place_of_is_gone_where_that_looks_like_what_is_arou
     assert not any((p.was & p.known).any() for p in known)
     assert left_by(SimpleNamespace(believe=AssociateConfig()), known, stage.old) is not None
     assert gone_score(known, stage.old)[1] > 50
+    assert background_seen(stage.past, stage.old) and not background_seen(known, stage.old)
+    for views, words in ((stage.past, "show what is behind it"), (known, "look like what is around it")):
+        settled = Settled(removed={0: 0.9}, views=tuple(views), olds=(stage.old,), led={0: 1.0})
+        told = concluded(Told(SimpleNamespace(field=BEFORE), (), stage.scene.changed, (), stage.scene.errors), settled)
+        assert f"90 % of its pixels {words}" in told.why
     other = []
     for c in stage.scene.changed:  # another thing stands there
         photo = c.view.photo.copy()

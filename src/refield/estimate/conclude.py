@@ -54,7 +54,7 @@ def concluded(scene: Told, settled: Settled) -> SceneChange:
     olds, frames = settled.olds, scene.frames
     changes = [_moved(frames, settled, k) for k in settled.moved]
     for k, share in settled.removed.items():
-        note = f"{100 * share:.0f} % of its pixels show what is behind it"
+        note = f"{100 * share:.0f} % of its pixels {_instead(settled, k)}"
         note += "; or it moved, and shows a side that no old photo saw" if settled.arrived else ""
         masks, sure = _masks_of(frames, olds[k]), confidence("removed", settled.led[k], bool(settled.arrived))
         changes.append(ObjectChange("removed", olds[k].shape, masks=masks, confidence=sure, note=note))
@@ -110,6 +110,13 @@ def _moved(frames: Sequence[Frame], settled: Settled, k: int) -> ObjectChange:
         alternatives=tuple(twin.new_from_old for twin in twins),
     )
     return replace(moved, note=_why_moved(change) + _or(change, twins))
+
+
+def _instead(settled: Settled, k: int) -> str:
+    """What the pixels of an object that left show."""
+    if past.background_seen(settled.views, settled.olds[k]):
+        return "show what is behind it"
+    return "look like what is around it, since no old photo shows what is behind"
 
 
 def _or(change: PoseChange, twins: Sequence[PoseChange]) -> str:

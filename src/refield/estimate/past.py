@@ -160,6 +160,19 @@ def silhouette(view: View, old: Old) -> Mask:
     return pixels.close(on.numpy(), 3)
 
 
+def background_seen(past: Sequence[Past], old: Old) -> bool:
+    """Whether old photos saw enough of what is behind an object for `gone_score` to go by that."""
+    return _asked(past, old)[1]
+
+
+def _asked(past: Sequence[Past], old: Old) -> tuple[list[Mask], bool]:
+    """The pixels (H, W) of each photo that are asked whether an object is gone; whether their background was seen."""
+    shown = [silhouette(p.view, old) & p.was & p.telling & ~p.covered for p in past]
+    known = [s & p.known for s, p in zip(shown, past)]
+    seen = sum(int(k.sum()) for k in known) >= FEWEST_ASKED
+    return known if seen else [s & ~k for s, k in zip(shown, known)], seen
+
+
 def gone_score(past: Sequence[Past], old: Old) -> tuple[float, int]:
     """How much better the photos agree with what is behind than with the object: (part of the pixels asked, pixels).
 
@@ -167,15 +180,12 @@ def gone_score(past: Sequence[Past], old: Old) -> tuple[float, int]:
     before which no object that was placed stands. Where there are next to none, as of what lies flat, those are asked
     whose background nobody knows: whether they look like what is around.
     """
-    shown = [silhouette(p.view, old) & p.was & p.telling & ~p.covered for p in past]
-    asked = sum(int((s & p.known).sum()) for s, p in zip(shown, past))
-    if asked >= FEWEST_ASKED:
-        here = [s & p.known for s, p in zip(shown, past)]
+    here, seen = _asked(past, old)
+    if seen:
         alike = [p.difference < 0.7 * p.changed.difference for p in past]
     else:
-        here = [s & ~p.known for s, p in zip(shown, past)]
         alike = [p.around < p.changed.threshold for p in past]
-        asked = sum(int(h.sum()) for h in here)
+    asked = sum(int(h.sum()) for h in here)
     better = sum(int((h & a & p.changed.mask).sum()) for h, a, p in zip(here, alike, past))
     return (better / asked if asked else 0.0), asked
 
