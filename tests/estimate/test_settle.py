@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from refield.estimate import fit, recipe, rotations, settle
-from refield.estimate.faces import Part, Parts
+from refield.estimate.faces import Part
 from refield.estimate.lattice import Body, Lattice, grown, some_of
 from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of
@@ -379,12 +379,33 @@ def test_what_turned_where_it_stands_is_asked_for_though_it_does_not_look_gone(
     scene = recipe._detected(capture, BEFORE, frames, CONFIG, Models())
     assert fit.left_by(ground, settle.without(ground, scene.changed, [old]), old) is None
     monkeypatch.setattr(recipe, "_were_there", lambda *_: [old])
-    monkeypatch.setattr(recipe, "unexplained", lambda *_: False)
     body = Body(old.lattice, old.voxels)
-    parts = Parts([], [Part(SimpleNamespace(lattice=body.lattice), body.voxels, body.voxels)])
-    assert recipe._overlooked(scene, ground, Settled(), parts, []) == [old]
-    still = replace(scene, changed=tuple(replace(c, mask=np.zeros_like(c.mask)) for c in scene.changed))
-    assert recipe._overlooked(still, ground, Settled(), parts, []) == []
+    others = [Part(SimpleNamespace(lattice=body.lattice), body.voxels, body.voxels)]
+    nothing = Settled(views=tuple(ground.past(scene.changed, [])))
+    assert recipe._overlooked(scene, ground, nothing, others, []) == [old]
+    still = tuple(replace(c, mask=np.zeros_like(c.mask), difference=0 * c.difference) for c in scene.changed)
+    same = tuple(replace(p, changed=c, rgb=c.view.photo) for p, c in zip(nothing.views, still))
+    assert recipe._overlooked(replace(scene, changed=still), ground, replace(nothing, views=same), others, []) == []
+
+
+def test_what_much_is_left_of_may_have_slid_though_nothing_arrived(estimated):
+    ground, (old,), changed, _ = estimated
+    search, beside = settle.Search(ground, changed), replace(old)
+    told = Settled({}, {1: 1.0}, (), tuple(ground.past(changed, [])), (old, beside))
+    assert {k for k, _ in search._asked(told)} == {0}
+    explained = tuple(replace(p, rgb=p.view.photo) for p in told.views)
+    assert search._asked(replace(told, views=explained)) == []
+
+
+def test_all_that_went_along_with_a_half_is_told_though_the_other_seems_to_have_left(estimated):
+    ground, (old,), changed, found = estimated
+    left = (old.lattice.centres - old.centre)[..., 0] < 0
+    half, other = (restricted(old, old.voxels & side, ground.shape) for side in (left, ~left))
+    apart = Settled(found.moved, {1: 0.9}, (), found.views, (half, other), (0, 1))
+    (whole,) = settle.Search(ground, changed)._with_along(apart, 0, half, found.moved[0])
+    assert set(whole.moved) == {0} and not whole.removed and not whole.arrived
+    assert other.within(whole.olds[0]) and whole.olds[0].volume == pytest.approx(old.volume, rel=0.2)
+    assert judged(ground, whole)[1] == pytest.approx(judged(ground, found)[1], rel=0.1)
 
 
 def test_settling_more_keeps_what_was_settled(estimated):

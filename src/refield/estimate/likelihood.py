@@ -8,6 +8,7 @@ every photo that shows it, and less where it went: a pose is six numbers, whatev
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -79,9 +80,22 @@ def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     return told, cost + sum(float(e.sum()) for e in left)
 
 
-def wrong_at(ground: Ground, settled: Settled) -> list[Array]:
-    """(H, W) what the hypothesis leaves unexplained of each pixel of each photo, newcomers left out."""
-    return [_left(ground, settled, p)[0] for p in settled.views]
+def left_at(ground: Ground, settled: Settled) -> Callable[..., float]:
+    """How much the hypothesis leaves unexplained where an object was, newcomers left out.
+
+    Returns:
+        of an object, the pixels that are left, over all photos; 0 if they are fewer than it costs that it left, or than
+        a part of its own, the second argument.
+    """
+    wrong = [_left(ground, settled, p)[0] for p in settled.views]
+
+    def left(one: Old | Body, least: float = 0.0) -> float:
+        shown = [silhouette(p.view, one) for p in settled.views]
+        left = sum(float(w[s].sum()) for w, s in zip(wrong, shown))
+        enough = max(least * sum(int(s.sum()) for s in shown), price(shown, ground.believe.smallest))
+        return left if left > enough else 0.0
+
+    return left
 
 
 def _left(ground: Ground, settled: Settled, p: Past) -> tuple[Array, Mask, list[Mask]]:

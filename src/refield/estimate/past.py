@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from refield.estimate.detect import Changed, DetectConfig, Mask, blur_sigma, difference
 from refield.estimate.hull import HullConfig, tolerance
-from refield.estimate.lattice import grown
+from refield.estimate.lattice import Body, grown
 from refield.estimate.look import Array, Hidden, View, see
 from refield.estimate.memory import Memory
 from refield.estimate.objects import Old
@@ -151,7 +151,7 @@ def _beneath(view: View, depth: Array, olds: Sequence[Old], where: Mask) -> Mask
     return out
 
 
-def silhouette(view: View, old: Old) -> Mask:
+def silhouette(view: View, old: Old | Body) -> Mask:
     """Pixels that show the object where the old field has it in front."""
     near = old.lattice.grid(old.voxels.astype(np.float32))
     points = torch.from_numpy(np.nan_to_num(view.surface, posinf=1e9, neginf=-1e9))

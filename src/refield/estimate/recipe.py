@@ -10,15 +10,14 @@ import numpy as np
 import torch
 
 from refield.estimate import detect, hull, light, look
-from refield.estimate.associate import is_crumb, may_have_changed
 from refield.estimate.conclude import Told, concluded, disagreeing
 from refield.estimate.detect import Changed, DetectConfig, Errors, Mask
-from refield.estimate.faces import Part, Parts, changed_parts
+from refield.estimate.faces import Part, changed_parts
 from refield.estimate.ground import AssociateConfig, Ground
 from refield.estimate.hull import Hull, HullConfig
 from refield.estimate.lattice import grown
 from refield.estimate.light import SAME_PLACE
-from refield.estimate.likelihood import Settled
+from refield.estimate.likelihood import Settled, left_at
 from refield.estimate.look import Array, View
 from refield.estimate.memory import Memory
 from refield.estimate.models import ModelConfig, Models
@@ -30,7 +29,7 @@ from refield.estimate.paper.route import estimate_change_paper
 from refield.estimate.place import PlaceConfig, place
 from refield.estimate.pose_change import RefineConfig
 from refield.estimate.register import RegisterConfig
-from refield.estimate.settle import Search, is_piece, unexplained
+from refield.estimate.settle import Search, is_piece
 from refield.estimate.tally import OnCount, Tally
 from refield.field.radiance import Field, check_field
 from refield.field.source import Known
@@ -159,7 +158,7 @@ def estimate_change(
     search = Search(ground, scene.changed)
     settled = search.settle(olds)
     told = [*olds, *settled.gone]
-    more = _overlooked(scene, ground, settled, parts, told) if parts.things else []
+    more = _overlooked(scene, ground, settled, parts.others, told) if parts.things else []
     if more:
         settled = search.settle([o for o in more if not is_piece(o, [*told, *more])], settled)
     settled = search.turned(settled)
@@ -313,20 +312,14 @@ def _were_there(scene: _Scene, parts: Sequence[Part], known: Sequence[Old] = ())
     return found
 
 
-def _overlooked(scene: _Scene, ground: Ground, settled: Settled, parts: Parts, known: list[Old]) -> list[Old]:
-    """Objects that look like what a newcomer hides, since they go on outside of the changed pixels, and yet changed.
-
-    What they would explain is explained by nothing else, or most of their pixels changed: what turned where it stands
-    does not look gone. Crumbs are none, unless an earlier visit knows them.
-    """
-    least = 0.15 * max(p.body.volume for p in (*parts.things, *parts.others))
-    more: list[Old] = []
-    for part in parts.others:
-        needed = unexplained(ground, settled, part.body)
-        if needed or part.body.volume >= least:
+def _overlooked(scene: _Scene, ground: Ground, settled: Settled, others: Sequence[Part], known: list[Old]) -> list[Old]:
+    """Objects that look like what a newcomer hides, since they go on outside of the changed pixels, and yet changed:
+    more is left unexplained where they were than it costs that they did, or an earlier visit knows them."""
+    more, left = list[Old](), left_at(ground, settled)
+    for part in others:
+        if left(part.body):
             found = _were_there(scene, [replace(part, where=part.voxels)], [*known, *more])
-            found = [o for o in found if o.remembered or not is_crumb(ground, scene.changed, o)]
-            more += [old for old in found if needed or may_have_changed(ground, scene.changed, old)]
+            more += [old for old in found if old.remembered or left(old)]
     return more
 
 

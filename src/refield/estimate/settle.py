@@ -16,11 +16,11 @@ from itertools import count
 import numpy as np
 import torch
 
-from refield.estimate.arrive import exactly, fresh, newcomers, remarkable, shadow_of
+from refield.estimate.arrive import exactly, fresh, newcomers, remarkable
 from refield.estimate.associate import may_have_changed, place_all, places_of, without
 from refield.estimate.comoving import with_comoving
 from refield.estimate.consist import consistent
-from refield.estimate.cost import CAME, price
+from refield.estimate.cost import CAME
 from refield.estimate.detect import Changed
 from refield.estimate.fit import (
     ALIKE,
@@ -39,16 +39,15 @@ from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
 from refield.estimate.lattice import Body
 from refield.estimate.layers import Sight
-from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of, wrong_at
+from refield.estimate.likelihood import Settled, judged, left_at, pixels_at, pixels_of
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import as_one, standing
-from refield.estimate.past import Past, silhouette
+from refield.estimate.past import Past
 from refield.estimate.pose_change import FINER, PoseChange, refine
 from refield.estimate.rotations import best_rotations, may_be_turned, rotated_at
 from refield.estimate.split import halves
 from refield.scene.pose import invert, transform
-from refield.vision import pixels
 
 _Tries = Callable[[Settled], Iterator[Settled]]
 _Which = tuple[str, int, int]
@@ -180,20 +179,12 @@ class Search:
     def _pieces(self, best: Settled) -> list[Old]:
         """Pieces of what was outlined at first that changed, and of which more is left unexplained than the pixels of a
         newcomer cost; those where most is left come first."""
-        wrong, believe = wrong_at(self.ground, best), self.ground.believe
-
-        def left_at(one: Old, least: float) -> float:
-            """What is left unexplained where it was; 0 if that is too little."""
-            shown = [silhouette(p.view, one) for p in best.views]
-            left = sum(float(w[s].sum()) for w, s in zip(wrong, shown))
-            enough = max(least * sum(int(s.sum()) for s in shown), price(shown, believe.smallest))
-            return left if left > enough else 0.0
-
+        believe, left = self.ground.believe, left_at(self.ground, best)
         worth: list[tuple[float, Old]] = []
         for old in self.first.values():
-            if left_at(old.outlines[-1], 0.0):
+            if left(old.outlines[-1]):
                 pieces = self.pieces.get((old,), partial(_cut_up, self.ground, self.changed, old))
-                worth += [(left, one) for one in pieces if (left := left_at(one, CAME))]
+                worth += [(much, one) for one in pieces if (much := left(one, CAME))]
         worth.sort(key=lambda w: -w[0])
         return [one for _, one in worth[: believe.most]]
 
@@ -213,11 +204,7 @@ class Search:
                     yield self._with(told, k, fit.old, change)
         if fits:
             old, change = max(fits, key=lambda f: f[1].net)
-            along = self._outlined(alone, k, old, change)
-            again = None if along is None else self._refined(alone, k, along, change)
-            if along is not None and again is not None:
-                self.anew[id(along)] = along
-                yield self._with(alone, k, along, again)
+            yield from self._with_along(alone, k, old, change)
 
     def _parted(self, best: Settled) -> Iterator[Settled]:
         """With several pieces for things, each where most of it is explained: one alone may leave more to a newcomer
@@ -299,8 +286,10 @@ class Search:
     def _outlines(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object outlined by its motion; the rest may be a thing that left."""
         old, change = best.olds[k], best.moved.get(k)
-        if id(old) in self.anew or (change is None and k not in best.removed):
+        if change is None and (id(old) in self.anew or k not in best.removed):
             return
+        if change is not None and best.removed:
+            yield from self._with_along(best, k, old, change)
         other = self._outlined(best, k, old, change)
         if other is None:
             return
@@ -316,7 +305,8 @@ class Search:
         """All that went along with an object."""
         if old.remembered:
             return None
-        return self.outlined.get((old, change), partial(self._comoving, best, k, old, change))
+        left = (best.olds[j] for j in best.removed if j != k)
+        return self.outlined.get((old, change, *left), partial(self._comoving, best, k, old, change))
 
     def _comoving(self, best: Settled, k: int, old: Old, change: PoseChange | None) -> Old | None:
         gone, views = self._without(best, k, old)
@@ -428,11 +418,14 @@ class Search:
 
         Those are not looked for before: what seems to have arrived is where they were, and most of them to have stayed.
         """
-        if not best.arrived and (best.moved or best.removed):
-            return []
-        came = [_box(body) for body in best.arrived]
+        came, left = [_box(body) for body in best.arrived], left_at(self.ground, best)
+        anywhere = not best.arrived and not best.moved and not best.removed
         olds = {k: old for k, old in enumerate(best.olds) if k not in best.removed}
-        some = {k: old for k, old in olds.items() if _beside(_box(Body(old.lattice, old.voxels)), came)}
+        some = {
+            k: old
+            for k, old in olds.items()
+            if anywhere or _beside(_box(Body(old.lattice, old.voxels)), came) or (k not in best.moved and left(old))
+        }
         asked = [(k, one) for k, old in some.items() for one in old.outlines]
         return asked + self._whole(some)
 
@@ -448,6 +441,16 @@ class Search:
             change = self._refined(best, k, fit.old, fit.change)
             if change is not None:
                 yield self._with(best, k, fit.old, change)
+                yield from self._with_along(best, k, fit.old, change)
+
+    def _with_along(self, best: Settled, k: int, old: Old, change: PoseChange) -> Iterator[Settled]:
+        """With all that went along with an object, also of what seems to have left."""
+        best = replace(best, removed={})
+        along = self._outlined(best, k, old, change)
+        again = None if along is None else self._refined(best, k, along, change)
+        if along is not None and again is not None:
+            self.anew[id(along)] = along
+            yield self._with(best, k, along, again)
 
     def _whole(self, pieces: dict[int, Old]) -> list[tuple[int, Old]]:
         """The whole things, where they stand free, each once, by one of its pieces."""
@@ -481,11 +484,11 @@ def _box(body: Body) -> Array:
 
 
 def _beside(box: Array, others: Sequence[Array]) -> bool:
-    """Whether a box is no further from one of the others than either is long, in each direction; true of none."""
+    """Whether a box is no further from one of the others than either is long, in each direction."""
     apart = [
         np.maximum(box[0] - o[1], o[0] - box[1]).max() - max((b[1] - b[0]).max() for b in (box, o)) for o in others
     ]
-    return not apart or min(apart) <= 0
+    return min(apart, default=math.inf) <= 0
 
 
 def _completed(
@@ -515,17 +518,6 @@ def _completed(
     # what its colours leave of it must be as believable as the whole was
     arrived = [exactly(ground, body, views) for body in arrived if fresh(views, body) >= ground.believe.arrived]
     return Settled(moved, removed, tuple(arrived), tuple(views), tuple(olds), tuple(touched))
-
-
-def unexplained(ground: Ground, settled: Settled, asked: Body) -> bool:
-    """Whether most of the changed pixels that some voxels project to are not accounted for by what was settled."""
-    shown, left = 0, 0
-    for p in settled.views:
-        here = shadow_of(p.view, asked)
-        came = np.logical_or.reduce([shadow_of(p.view, body) for body in settled.arrived] or [np.zeros_like(here)])
-        shown += int(here.sum())
-        left += int((here & p.changed.mask & ~p.explained & ~pixels.dilate(came, 2)).sum())
-    return left > ground.believe.touched * shown
 
 
 def is_piece(old: Old, others: Sequence[Old]) -> bool:
