@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from refield.estimate import fit, recipe, rotations, settle
+from refield.estimate import arrive, fit, recipe, rotations, settle
 from refield.estimate.faces import Part
 from refield.estimate.lattice import Body, Lattice, grown, some_of
 from refield.estimate.layers import Sight
@@ -181,7 +181,7 @@ def test_what_only_darkens_all_that_is_behind_it_is_no_newcomer(estimated):
     views, body = came_to(ground, olds, changed)
     shaded = []
     for p in views:
-        here = pixels.dilate(settle.shadow_of(p.view, body), 6)
+        here = pixels.dilate(arrive.shadow_of(p.view, body), 6)
         dark = np.where(here[..., None], to_srgb(0.5 * to_linear(p.rgb)), p.view.photo).astype(np.float32)
         shaded.append(replace(p, changed=replace(p.changed, view=replace(p.view, photo=dark))))
     assert settle.newcomers(ground, shaded, list(olds)) == []
@@ -194,7 +194,7 @@ def test_dappled_light_is_what_every_photo_shows_on_the_same_surface(everywhere,
     views, body = came_to(ground, olds, changed)
     photos = []
     for k, p in enumerate(views):
-        here = pixels.dilate(settle.shadow_of(p.view, body), 6)
+        here = pixels.dilate(arrive.shadow_of(p.view, body), 6)
         at = np.where(here[..., None], replace(p.view, depth=p.depth).surface, 0)
         at = np.where(np.isfinite(at), at, 0) + (np.zeros(3) if everywhere else np.array([0.1 * k, 0, 0]))
         dapples = 0.55 + 0.4 * np.sin(25 * at[..., 0]) * np.sin(25 * at[..., 1])
@@ -250,7 +250,7 @@ def test_a_newcomer_is_asked_for_only_where_nothing_hides_it(estimated):
     views, whole = came_to(ground, olds, changed)
     hidden = []
     for p in views:
-        columns = np.flatnonzero(settle.shadow_of(p.view, whole).any(0))
+        columns = np.flatnonzero(arrive.shadow_of(p.view, whole).any(0))
         before = np.zeros(p.view.shape, bool)
         before[:, columns[: round(0.7 * len(columns))]] = True
         less = replace(p.changed, mask=p.changed.mask & ~before)
@@ -265,7 +265,7 @@ def test_a_newcomer_is_judged_by_what_the_photos_show_of_it(estimated, monkeypat
     monkeypatch.setattr(settle, "place_all", lambda _g, olds, *_: ({}, dict(olds[1])))
     (body,) = settle.Search(ground, changed)._placed(olds, Settled()).arrived
     views = settle.without(ground, changed, list(olds))
-    shown = [(settle.shadow_of(p.view, body), p.changed.mask) for p in views]
+    shown = [(arrive.shadow_of(p.view, body), p.changed.mask) for p in views]
     assert all((here & ~mask).sum() <= 0.1 * here.sum() for here, mask in shown if here.any())
 
 

@@ -79,6 +79,8 @@ class Search:
     """of an outline, that changed"""
     hypotheses: Kept[Settled] = field(default_factory=lambda: Kept(32))
     """by what was, what was touched and where it is"""
+    costs: Kept[tuple[Settled, float]] = field(default_factory=lambda: Kept(32))
+    """of hypotheses, as `judged` tells them"""
     outlined: Kept[Old | None] = field(default_factory=Kept)
     """what went along with an object, by its motion"""
     anew: dict[int, Old] = field(default_factory=dict)
@@ -89,7 +91,7 @@ class Search:
 
         ``begun``: what was settled before these objects were known; it stays unless they leave less unexplained.
         """
-        best, least = judged(self.ground, self._placed(olds, begun or Settled()))
+        best, least = self._judged(self._placed(olds, begun or Settled()))
         again = True
         tried: dict[_Which, float] = {}  # beside this best one
         while again:
@@ -98,14 +100,17 @@ class Search:
             for k, (this, tries) in enumerate(exchanges, start=1):
                 if this in tried:
                     continue
-                others = [judged(self.ground, other) for other in tries(best)]
+                others = [self._judged(other) for other in tries(best)]
                 other, tried[this] = min(others, key=lambda o: o[1], default=(best, math.inf))
                 if tried[this] < least - self._worth(best, other, this):
                     again, best, least, tried = True, other, tried[this], {}
                 self.ground.tally.count(sum(that not in tried for that, _ in exchanges[k:]))
-        if begun is not None and judged(self.ground, begun)[1] <= least:
+        if begun is not None and self._judged(begun)[1] <= least:
             return begun
         return self._led(best, least, tried)
+
+    def _judged(self, settled: Settled) -> tuple[Settled, float]:
+        return self.costs.get((settled,), lambda: judged(self.ground, settled))
 
     def _worth(self, best: Settled, other: Settled, this: _Which) -> float:
         """How many pixels less an exchange must leave unexplained. A piece fits more easily than a thing: it must gain
@@ -135,11 +140,11 @@ class Search:
         old, best = max(found, key=lambda one: one[1].explained, default=(told.olds[k], told.moved[k]))
         if not found or best.explained < found[0][1].explained + ALIKE:
             return told
-        other, left = judged(self.ground, self._with(told, k, old, best))
+        other, left = self._judged(self._with(told, k, old, best))
         if other.moved.keys() != told.moved.keys() or other.removed.keys() != told.removed.keys():
             return told
         gained = (best.explained - found[0][1].explained) * pixels_at(self.ground, other, k)
-        if left - judged(self.ground, told)[1] > gained:
+        if left - self._judged(told)[1] > gained:
             return told
         twins = all_apart((one for _, one in found if one.explained > best.explained - ALIKE), old, [best])
         return replace(other, led=told.led, twins={**told.twins, k: tuple(twins)})
@@ -156,7 +161,7 @@ class Search:
                 alike = (
                     one.moved[k]
                     for one in self._turned(best, k)
-                    if k in one.moved and judged(self.ground, one)[1] - least < ALIKE * asked
+                    if k in one.moved and self._judged(one)[1] - least < ALIKE * asked
                 )
                 twins[k] = tuple(all_apart(alike, best.olds[k], [best.moved[k]]))
         return replace(best, led=led, twins=twins)
@@ -441,7 +446,8 @@ class Search:
             change = self._refined(best, k, fit.old, fit.change)
             if change is not None:
                 yield self._with(best, k, fit.old, change)
-                yield from self._with_along(best, k, fit.old, change)
+                if k not in best.moved:
+                    yield from self._with_along(best, k, fit.old, change)
 
     def _with_along(self, best: Settled, k: int, old: Old, change: PoseChange) -> Iterator[Settled]:
         """With all that went along with an object, also of what seems to have left."""
