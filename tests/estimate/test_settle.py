@@ -383,9 +383,13 @@ def test_what_turned_where_it_stands_is_asked_for_though_it_does_not_look_gone(
     others = [Part(SimpleNamespace(lattice=body.lattice), body.voxels, body.voxels)]
     nothing = Settled(views=tuple(ground.past(scene.changed, [])))
     assert recipe._overlooked(scene, ground, nothing, others, []) == [old]
-    still = tuple(replace(c, mask=np.zeros_like(c.mask), difference=0 * c.difference) for c in scene.changed)
-    same = tuple(replace(p, changed=c, rgb=c.view.photo) for p, c in zip(nothing.views, still))
-    assert recipe._overlooked(replace(scene, changed=still), ground, replace(nothing, views=same), others, []) == []
+    explained = replace(nothing, views=tuple(replace(p, rgb=p.view.photo) for p in nothing.views))
+    assert recipe._overlooked(scene, ground, explained, others, []) == []
+    monkeypatch.setattr(recipe, "_known_at", lambda *_: "an earlier visit's")
+    assert recipe._overlooked(scene, ground, explained, others, []) == []
+    known = replace(old, remembered=True)
+    monkeypatch.setattr(recipe, "_were_there", lambda *_: [known])
+    assert recipe._overlooked(scene, ground, explained, others, []) == [known]
 
 
 def test_what_much_is_left_of_may_have_slid_though_nothing_arrived(estimated):
@@ -404,6 +408,9 @@ def test_all_that_went_along_with_a_half_is_told_though_the_other_seems_to_have_
     apart = Settled(found.moved, {1: 0.9}, (), found.views, (half, other), (0, 1))
     (whole,) = settle.Search(ground, changed)._with_along(apart, 0, half, found.moved[0])
     assert set(whole.moved) == {0} and not whole.removed and not whole.arrived
+    remembered = replace(apart, olds=(half, replace(other, remembered=True)))
+    for one in settle.Search(ground, changed)._with_along(remembered, 0, half, found.moved[0]):
+        assert not other.within(one.olds[0])  # known to be a thing of its own
     assert other.within(whole.olds[0]) and whole.olds[0].volume == pytest.approx(old.volume, rel=0.2)
     assert judged(ground, whole)[1] == pytest.approx(judged(ground, found)[1], rel=0.1)
 

@@ -80,20 +80,20 @@ def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     return told, cost + sum(float(e.sum()) for e in left)
 
 
-def left_at(ground: Ground, settled: Settled) -> Callable[..., float]:
-    """How much the hypothesis leaves unexplained where an object was, newcomers left out.
+def unexplained_at(ground: Ground, settled: Settled) -> Callable[[Old | Body, float], float]:
+    """How much the hypothesis leaves unexplained where something was, newcomers left out.
 
     Returns:
-        of an object, the pixels that are left, over all photos; 0 if they are fewer than it costs that it left, or than
-        a part of its own, the second argument.
+        of something that was, and a part of its pixels: the pixels that are left, over all photos; 0 if they are fewer
+        than it costs that it left, or than that part.
     """
     wrong = [_left(ground, settled, p)[0] for p in settled.views]
 
-    def left(one: Old | Body, least: float = 0.0) -> float:
+    def left(one: Old | Body, least: float) -> float:
         shown = [silhouette(p.view, one) for p in settled.views]
-        left = sum(float(w[s].sum()) for w, s in zip(wrong, shown))
+        much = sum(float(w[s].sum()) for w, s in zip(wrong, shown))
         enough = max(least * sum(int(s.sum()) for s in shown), price(shown, ground.believe.smallest))
-        return left if left > enough else 0.0
+        return much if much > enough else 0.0
 
     return left
 

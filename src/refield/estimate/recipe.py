@@ -17,7 +17,7 @@ from refield.estimate.ground import AssociateConfig, Ground
 from refield.estimate.hull import Hull, HullConfig
 from refield.estimate.lattice import grown
 from refield.estimate.light import SAME_PLACE
-from refield.estimate.likelihood import Settled, left_at
+from refield.estimate.likelihood import Settled, unexplained_at
 from refield.estimate.look import Array, View
 from refield.estimate.memory import Memory
 from refield.estimate.models import ModelConfig, Models
@@ -299,7 +299,7 @@ def _were_there(scene: _Scene, parts: Sequence[Part], known: Sequence[Old] = ())
         at, carved = part.body.places, part.carved
         if any(old.lattice.holds(grown(old.voxels, old.margin), at).mean() > 0.5 for old in (*known, *found)):
             continue
-        again = next((k for k in scene.known if k.grid.contains(torch.from_numpy(at)).float().mean() > 0.5), None)
+        again = _known_at(scene, part)
         if again is not None:
             old = remembered(scene.field, scene.capture.train, again, scene.planes, config.objects)
             if old is not None:
@@ -312,15 +312,22 @@ def _were_there(scene: _Scene, parts: Sequence[Part], known: Sequence[Old] = ())
     return found
 
 
-def _overlooked(scene: _Scene, ground: Ground, settled: Settled, others: Sequence[Part], known: list[Old]) -> list[Old]:
+def _overlooked(scene: _Scene, ground: Ground, settled: Settled, others: Sequence[Part], told: list[Old]) -> list[Old]:
     """Objects that look like what a newcomer hides, since they go on outside of the changed pixels, and yet changed:
-    more is left unexplained where they were than it costs that they did, or an earlier visit knows them."""
-    more, left = list[Old](), left_at(ground, settled)
+    more is left unexplained where they were than it costs that they did, newcomers left out; or an earlier visit knows
+    them."""
+    more, left = list[Old](), unexplained_at(ground, settled)
     for part in others:
-        if left(part.body):
-            found = _were_there(scene, [replace(part, where=part.voxels)], [*known, *more])
-            more += [old for old in found if old.remembered or left(old)]
+        if left(part.body, 0) or _known_at(scene, part) is not None:
+            found = _were_there(scene, [replace(part, where=part.voxels)], [*told, *more])
+            more += [old for old in found if old.remembered or left(old, 0)]
     return more
+
+
+def _known_at(scene: _Scene, part: Part) -> Known | None:
+    """The object that earlier visits found there, where it stood before this one."""
+    at = torch.from_numpy(part.body.places)
+    return next((k for k in scene.known if k.grid.contains(at).float().mean() > 0.5), None)
 
 
 def _up(capture: Capture) -> Array:

@@ -39,7 +39,7 @@ from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
 from refield.estimate.lattice import Body
 from refield.estimate.layers import Sight
-from refield.estimate.likelihood import Settled, judged, left_at, pixels_at, pixels_of
+from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of, unexplained_at
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import as_one, standing
@@ -82,7 +82,7 @@ class Search:
     costs: Kept[tuple[Settled, float]] = field(default_factory=lambda: Kept(32))
     """of hypotheses, as `judged` tells them"""
     outlined: Kept[Old | None] = field(default_factory=Kept)
-    """what went along with an object, by its motion"""
+    """what went along with an object, by its motion and by what else changed"""
     anew: dict[int, Old] = field(default_factory=dict)
     """what was outlined so, by its identity"""
 
@@ -184,10 +184,10 @@ class Search:
     def _pieces(self, best: Settled) -> list[Old]:
         """Pieces of what was outlined at first that changed, and of which more is left unexplained than the pixels of a
         newcomer cost; those where most is left come first."""
-        believe, left = self.ground.believe, left_at(self.ground, best)
+        believe, left = self.ground.believe, unexplained_at(self.ground, best)
         worth: list[tuple[float, Old]] = []
         for old in self.first.values():
-            if left(old.outlines[-1]):
+            if left(old.outlines[-1], 0):
                 pieces = self.pieces.get((old,), partial(_cut_up, self.ground, self.changed, old))
                 worth += [(much, one) for one in pieces if (much := left(one, CAME))]
         worth.sort(key=lambda w: -w[0])
@@ -289,12 +289,13 @@ class Search:
         return gone, without(self.ground, self.changed, gone, placed)
 
     def _outlines(self, best: Settled, k: int) -> Iterator[Settled]:
-        """With an object outlined by its motion; the rest may be a thing that left."""
+        """With an object outlined by its motion, and what seems to have left may be of it; or the rest of it may be a
+        thing that left."""
         old, change = best.olds[k], best.moved.get(k)
-        if change is None and (id(old) in self.anew or k not in best.removed):
-            return
         if change is not None and best.removed:
             yield from self._with_along(best, k, old, change)
+        if id(old) in self.anew or (change is None and k not in best.removed):
+            return
         other = self._outlined(best, k, old, change)
         if other is None:
             return
@@ -306,17 +307,18 @@ class Search:
             for one in (rest, None) if rest is not None else (None,):
                 yield self._with(best, k, other, change, one)
 
-    def _outlined(self, best: Settled, k: int, old: Old, change: PoseChange | None) -> Old | None:
-        """All that went along with an object."""
+    def _outlined(self, best: Settled, k: int, old: Old, change: PoseChange | None, apart: bool = True) -> Old | None:
+        """All that went along with an object; unless it is ``apart``, also of what seems to have left."""
         if old.remembered:
             return None
-        left = (best.olds[j] for j in best.removed if j != k)
-        return self.outlined.get((old, change, *left), partial(self._comoving, best, k, old, change))
-
-    def _comoving(self, best: Settled, k: int, old: Old, change: PoseChange | None) -> Old | None:
         gone, views = self._without(best, k, old)
         others = [o for o in gone if o is not old and not old.within(o)]
-        return with_comoving(self.ground, old, views, None if change is None else change.new_from_old, others)
+        if not apart:
+            left = [best.olds[j] for j in best.removed]
+            others = [o for o in others if o.remembered or not any(o is one for one in left)]
+        pose = None if change is None else change.new_from_old
+        make = partial(with_comoving, self.ground, old, views, pose, others)
+        return self.outlined.get((old, change, apart, *sorted(gone, key=id)), make)
 
     def _joined(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object and another that went where its motion takes it as one thing."""
@@ -423,19 +425,19 @@ class Search:
 
         Those are not looked for before: what seems to have arrived is where they were, and most of them to have stayed.
         """
-        came, left = [_box(body) for body in best.arrived], left_at(self.ground, best)
+        came, left = [_box(body) for body in best.arrived], unexplained_at(self.ground, best)
         anywhere = not best.arrived and not best.moved and not best.removed
         olds = {k: old for k, old in enumerate(best.olds) if k not in best.removed}
         some = {
             k: old
             for k, old in olds.items()
-            if anywhere or _beside(_box(Body(old.lattice, old.voxels)), came) or (k not in best.moved and left(old))
+            if anywhere or _beside(_box(Body(old.lattice, old.voxels)), came) or (k not in best.moved and left(old, 0))
         }
         asked = [(k, one) for k, old in some.items() for one in old.outlines]
         return asked + self._whole(some)
 
     def _slides(self, best: Settled, k: int, one: Old) -> Iterator[Settled]:
-        """With an object that slid."""
+        """With an object that slid, or all that went along with it."""
 
         def found() -> Fit | None:
             gone, views = self._without(best, k, one)
@@ -451,8 +453,7 @@ class Search:
 
     def _with_along(self, best: Settled, k: int, old: Old, change: PoseChange) -> Iterator[Settled]:
         """With all that went along with an object, also of what seems to have left."""
-        best = replace(best, removed={})
-        along = self._outlined(best, k, old, change)
+        along = self._outlined(best, k, old, change, apart=False)
         again = None if along is None else self._refined(best, k, along, change)
         if along is not None and again is not None:
             self.anew[id(along)] = along
