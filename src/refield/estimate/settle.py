@@ -289,12 +289,12 @@ class Search:
         return gone, without(self.ground, self.changed, gone, placed)
 
     def _outlines(self, best: Settled, k: int) -> Iterator[Settled]:
-        """With an object outlined by its motion, and what seems to have left may be of it; or the rest of it may be a
-        thing that left."""
+        """With an object outlined by its motion, again from the outline that this gave before, and what seems to have
+        left may be of it; or the rest of it may be a thing that left."""
         old, change = best.olds[k], best.moved.get(k)
         if change is not None and best.removed:
             yield from self._with_along(best, k, old, change)
-        if id(old) in self.anew or (change is None and k not in best.removed):
+        if change is None and (id(old) in self.anew or k not in best.removed):
             return
         other = self._outlined(best, k, old, change)
         if other is None:
