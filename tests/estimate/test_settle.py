@@ -415,6 +415,17 @@ def test_all_that_went_along_with_a_half_is_told_though_the_other_seems_to_have_
     assert judged(ground, whole)[1] == pytest.approx(judged(ground, found)[1], rel=0.1)
 
 
+def test_what_slid_or_was_outlined_anew_is_asked_what_went_along(estimated, monkeypatch):
+    ground, (old,), changed, found = estimated
+    half = restricted(old, old.voxels & ((old.lattice.centres - old.centre)[..., 0] < 0), ground.shape)
+    search = settle.Search(ground, changed, anew={id(half): half})
+    told = replace(found, olds=(half,))
+    assert any(old.within(one.olds[0]) for one in search._outlines(told, 0))
+    monkeypatch.setattr(settle, "slid", lambda *_: fit.Fit(0.0, half, found.moved[0]))
+    alone, whole = search._slides(replace(told, moved={}, touched=()), 0, half)
+    assert alone.olds[0] is half and old.within(whole.olds[0]) and set(whole.moved) == {0}
+
+
 def test_settling_more_keeps_what_was_settled(estimated):
     ground, olds, changed, found = estimated
     search = settle.Search(ground, changed)
