@@ -98,8 +98,9 @@ def test_the_same_pictures(runs, kind):
     off = []
     for origin, d, rgb in zip(rays.origins.double().numpy(), rays.directions.double().numpy(), shown.rgb.numpy()):
         off.append(np.abs(theirs.pixel(m[:3, :3] @ origin + m[:3, 3], m[:3, :3] @ d / scale) - rgb).max())
-    # in single precision far samples come to lie elsewhere by a thousandth of their distance, in noise
-    assert np.median(off) < 1e-4 and max(off) < 1e-3
+    # in single precision far samples come to lie elsewhere in noise, by how much differs from machine to machine;
+    # rays that begin elsewhere by a thousandth are 1e-3 and 7e-3 off
+    assert np.median(off) < 4e-4 and max(off) < 3e-3
     assert bool((shown.opacity > 0.999).all())
     clear = render_rays(_without_sky(field), rays)
     assert float(clear.opacity.min()) < 0.9, "the last sample has something to say"
