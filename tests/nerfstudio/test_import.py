@@ -98,9 +98,10 @@ def test_the_same_pictures(runs, kind):
     off = []
     for origin, d, rgb in zip(rays.origins.double().numpy(), rays.directions.double().numpy(), shown.rgb.numpy()):
         off.append(np.abs(theirs.pixel(m[:3, :3] @ origin + m[:3, 3], m[:3, :3] @ d / scale) - rgb).max())
-    # in single precision far samples come to lie elsewhere in noise, by how much differs from machine to machine;
-    # rays that begin elsewhere by a thousandth are 1e-3 and 7e-3 off
-    assert np.median(off) < 4e-4 and max(off) < 3e-3
+    # in single precision far samples come to lie elsewhere in the packed run's noise, by how much differs from machine
+    # to machine; rays that begin elsewhere by a thousandth are 1e-3 and 7e-3 off there, 1.3e-5 and 2.8e-5 in the others
+    median, most = (4e-4, 3e-3) if kind == "packed" else (5e-6, 2e-5)
+    assert np.median(off) < median and max(off) < most
     assert bool((shown.opacity > 0.999).all())
     clear = render_rays(_without_sky(field), rays)
     assert float(clear.opacity.min()) < 0.9, "the last sample has something to say"

@@ -318,7 +318,7 @@ class Search:
             others = [o for o in others if o.remembered or not any(o is one for one in left)]
         pose = None if change is None else change.new_from_old
         make = partial(with_comoving, self.ground, old, views, pose, others)
-        return self.outlined.get((old, change, apart, *sorted(gone, key=id)), make)
+        return self.outlined.get((old, change, *sorted(gone, key=id), None, *sorted(others, key=id)), make)
 
     def _joined(self, best: Settled, k: int) -> Iterator[Settled]:
         """With an object and another that went where its motion takes it as one thing."""
