@@ -357,7 +357,7 @@ def step_parts(model: HashField, rays: int = 20) -> tuple:
     colours = torch.rand(rays, 3).masked_fill(torch.rand(rays, 3) < 0.2, 1.0)
     batch = Batch(asked[0], colours, torch.rand(rays, 3), 0.5 + torch.rand(rays, 3), torch.rand(rays), rays // 2)
     field = (model.encoding.tables.detach(), model.encoding.resolutions, tuple(w.detach() for w in model.networks))
-    return batch, *asked[1:], field, Aim(1e-2, 1.5, 7.0)
+    return batch, *asked[1:], field, Aim(1e-2, 1.5, 7.0, 0.6)
 
 
 def zeros_for(field: tuple) -> list[Tensor]:
@@ -424,7 +424,7 @@ def graphed_step(
     sampler = model.sampler
     space = (sampler.contraction.centre, sampler.contraction.radius)
     where = (space, sampler.grid, (0.0, 8.0, 0.3), model.encoding.resolutions)
-    occupancy, aim = (occupancy_state(model).to(DEVICE), 0.8), Aim(1e-2, 1.0, 7.0)
+    occupancy, aim = (occupancy_state(model).to(DEVICE), 0.8), Aim(1e-2, 1.0, 7.0, 0.6)
     pixels = DevicePixels(bank(), DEVICE)
     with torch.device(DEVICE):
         photos = PhotoModel(pixels, sampler, asked or PhotoModelConfig())

@@ -233,7 +233,7 @@ def test_train_step(fill: float, scale: float, rays: int) -> None:
         into = [torch.zeros_like(p) for p in (tables, *nets)]
         space = (torch.tensor([0.1, 0.0, 0.2]), 1.5)
         field = (tables, resolutions, nets)
-        aim = reference.Aim(distortion=0.3, gradient_unit=2.5, stop=7.0)
+        aim = reference.Aim(distortion=0.3, gradient_unit=2.5, stop=7.0, nearness=0.6)
         results.append((twin.train_step(batch, space, grid, (0.0, 60.0, 0.05), field, aim, into), into))
     (truth, true_grads), (fast, grads) = results
     assert fast.rays == truth.rays and fast.loss == pytest.approx(truth.loss, rel=1e-4)
@@ -316,7 +316,7 @@ def test_woven_step(fill: float, segments: int, rays: int) -> None:
     for twin in (reference, cpu):
         into = [torch.zeros_like(p) for p in (tables, *nets)]
         space, field = (torch.tensor([0.1, 0.0, 0.2]), 1.5), (tables, resolutions, nets)
-        aim = reference.Aim(distortion=0.3, gradient_unit=2.5, stop=7.0)
+        aim = reference.Aim(distortion=0.3, gradient_unit=2.5, stop=7.0, nearness=0.6)
         step = twin.woven_step(batch, fixed, unwanted, space, grid, (0.0, 60.0, 0.05), field, aim, into)
         results.append((step, into))
     (truth, true_grads), (fast, grads) = results

@@ -51,6 +51,9 @@ class FitConfig:
     distortion: float = 1e-2
     """weight of the distortion loss; without it fog fills the grid. Of dim photos less, as their squared errors
     of colour are: times the square of `PixelBank.brightness`"""
+    nearness: float = 0.25
+    """weight, times that of the distortion, of how near to the camera light ends. Haze before what is plain gathers
+    where 1/2 + nearness/4 of the light has ended; where half of it has, which is without it, that is mostly too near"""
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera"""  # §10.1
     directions: bool = True
@@ -388,7 +391,7 @@ class _Fit(Fitting):
         asked = self.photos.ask(self.taught.drawn(self.pixels, n), progress)
         model, sampler = self.model, self.model.sampler
         space = (sampler.contraction.centre, sampler.contraction.radius)
-        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP)
+        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP, self.config.nearness)
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
         where = (space, sampler.grid, sampler.lattice)
         done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, fine=sampler.fine)

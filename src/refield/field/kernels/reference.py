@@ -56,6 +56,8 @@ class Aim(NamedTuple):
     """gradients of samples nearer than this, world units, are scaled down by the square of their distance (§10.1)"""
     stop: float
     """optical depth at which a ray ends"""
+    nearness: float = 0.0
+    """weight, times that of the distortion, of how near to the camera light ends"""
 
 
 class Stepped(NamedTuple):
@@ -237,6 +239,17 @@ def distortion(w: Tensor, s_starts: Tensor, s_ends: Tensor, offsets: Tensor) -> 
     wm_before = _exclusive_sum(w * mid, offsets)
     each = 2 * w * (mid * w_before - wm_before) + w * w * (s_ends - s_starts) / 3
     return each.new_zeros(len(offsets) - 1).index_add(0, _ray_ids(offsets), each)
+
+
+def nearness(w: Tensor, s_starts: Tensor, s_ends: Tensor, offsets: Tensor) -> Tensor:
+    """How near the light of each ray ends, (N,): sum_i w_i (1 - m_i)."""
+    return accumulate(w, (1 - (s_starts + s_ends) / 2)[:, None], offsets)[:, 0]
+
+
+def spread(w: Tensor, s_starts: Tensor, s_ends: Tensor, offsets: Tensor, aim: Aim) -> Tensor:
+    """What a step pays for where the light of each ray ends, (N,)."""
+    ends = s_starts, s_ends, offsets
+    return aim.distortion * (distortion(w, *ends) + aim.nearness * nearness(w, *ends))
 
 
 def march(
@@ -461,8 +474,8 @@ def train_step(
 ) -> Stepped:
     """March, evaluate, composite, compare and go back: adds d loss / d parameter to ``into`` (tables, five matrices).
 
-    loss = mean of trust times squared colour error (Eq. 2) + aim.distortion * mean distortion, distances in
-    s = t / (t + radius). The error is that of gains * shown + background, 0 where a photo is burnt out and less bright.
+    loss = mean of trust times squared colour error (Eq. 2) + mean `spread`, distances in s = t / (t + radius). The
+    error is that of gains * shown + background, 0 where a photo is burnt out and less bright.
     """
     tables, resolutions, networks = field
     origins, directions, _ = batch.rays
@@ -481,7 +494,7 @@ def train_step(
         errors = compared(shown, batch)
         s0, s1 = (t / (t + space[1]) for t in (t0, t1))
         counts = 1.0 if batch.trust is None else batch.trust[:, None]
-        loss = (counts * errors.square()).mean() + aim.distortion * distortion(w, s0, s1, offsets).mean()
+        loss = (counts * errors.square()).mean() + spread(w, s0, s1, offsets, aim).mean()
     wanted = leaves + (ways if batch.moving else [])
     grads = torch.autograd.grad(loss, wanted)
     for total, grad in zip(into, grads):
@@ -567,7 +580,7 @@ def woven_step(
         total = accumulate(w, torch.cat([rgb, torch.ones_like(w)[:, None]], -1), both)
         seen = total[:, :3] + (1 - total[:, 3:]) * batch.background
         s0, s1 = (t / (t + space[1]) for t in (begin, end))
-        loss = (seen - batch.colours).square().mean() + aim.distortion * distortion(w, s0, s1, both).mean()
+        loss = (seen - batch.colours).square().mean() + spread(w, s0, s1, both, aim).mean()
         loss = loss + (w[own] * unwanted.misplaced[cells]).sum() / len(batch.colours)
     for into_one, grad in zip(into, torch.autograd.grad(loss, leaves)):
         into_one += grad

@@ -62,7 +62,7 @@ def _along_ray(first, n, at, rgb, scratch, aim, told, w, sigma, to_raw, to_rgb):
     the step's, in which it begins at ``first``. ``told`` ends with where to write
     what is shown and the error, (3,) each, and the heaviest sample, (1,).
     """
-    radius, strength, _, rays = aim
+    radius, strength, _, rays, nearness = aim
     truth, background, gain, trust, shown, error, heaviest = told
     passes, mids, lengths, nears, deltas = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
     red = green = blue = mass = moment = most = _ZERO
@@ -94,7 +94,7 @@ def _along_ray(first, n, at, rgb, scratch, aim, told, w, sigma, to_raw, to_rgb):
         before, moment_before = before + w[j], moment_before + w[j] * mid
         right = (moment - moment_before) - mid * (mass - before)
         spread += _TWO * w[j] * left + w[j] * w[j] * length / _THREE
-        slope = _TWO * (left + right) + _TWO * w[j] * length / _THREE
+        slope = _TWO * (left + right) + _TWO * w[j] * length / _THREE + nearness * (_ONE - mid)
         to_raw[k] = g0 * rgb[k, 0] + g1 * rgb[k, 1] + g2 * rgb[k, 2] - behind + strength * slope / rays
         total += w[j] * to_raw[k]
         share = w[j] * nears[k]
@@ -106,6 +106,7 @@ def _along_ray(first, n, at, rgb, scratch, aim, told, w, sigma, to_raw, to_rgb):
         total -= w[j] * to_raw[k]
         grown = min(sigma[j], np.float32(3e4) / radius)
         to_raw[k] = deltas[k] * (clear * to_raw[k] - total) * nears[k] * grown
+    spread += nearness * (mass - moment)
     return trust * (d0 * d0 + d1 * d1 + d2 * d2) / (_THREE * rays) + strength * spread / rays
 
 
@@ -203,8 +204,10 @@ def after_march(
 
 def toward(aim: Aim, space: Space, rays: int) -> tuple[np.float32, ...]:
     """What the loops want to know of the aim."""
-    radius, strength, unit, count = (np.float32(x) for x in (space[1], aim.distortion, aim.gradient_unit, rays))
-    return radius, strength, unit, count
+    radius, strength, unit, count, nearness = map(
+        np.float32, (space[1], aim.distortion, aim.gradient_unit, rays, aim.nearness)
+    )
+    return radius, strength, unit, count, nearness
 
 
 def scattered(

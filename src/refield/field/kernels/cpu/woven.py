@@ -24,7 +24,7 @@ def _along_ray(first, n, at, rgb, scratch, fixed, wrong, aim, told, row, w, sigm
     ``row`` (5, M) and its places (M,) are room for the two put together: what passes, the place, the length, the
     weight and its gradient of each; ``told`` begins with the samples' ends and the ray's own segments.
     """
-    radius, strength, _, rays = aim
+    radius, strength, _, rays, nearness = aim
     t0, t1, own_fixed, end_fixed, truth, background = told
     t_mid, depth, colours = fixed
     passes, mids, lengths, nears, deltas = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
@@ -63,7 +63,8 @@ def _along_ray(first, n, at, rgb, scratch, fixed, wrong, aim, told, row, w, sigm
         before, moment_before = before + here, moment_before + here * mid
         right = (moment - moment_before) - mid * (mass - before)
         spread += _TWO * here * left + here * here * length / _THREE
-        steep = strength * (_TWO * (left + right) + _TWO * here * length / _THREE) / rays
+        apart = _TWO * (left + right) + _TWO * here * length / _THREE
+        steep = strength * (apart + nearness * (_ONE - mid)) / rays
         if which[q] >= 0:
             k, s = at + which[q], first + which[q]
             share = here * nears[k]
@@ -84,6 +85,7 @@ def _along_ray(first, n, at, rgb, scratch, fixed, wrong, aim, told, row, w, sigm
             k, s = at + which[q], first + which[q]
             grown = min(sigma[s], np.float32(3e4) / radius)
             to_raw[k] = deltas[k] * (clear * slope[q] - total) * nears[k] * grown
+    spread += nearness * (mass - moment)
     return (d0 * d0 + d1 * d1 + d2 * d2) / (_THREE * rays) + (strength * spread + misplaced) / rays
 
 
