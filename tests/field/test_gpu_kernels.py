@@ -424,7 +424,7 @@ def graphed_step(
     sampler = model.sampler
     space = (sampler.contraction.centre, sampler.contraction.radius)
     where = (space, sampler.grid, (0.0, 8.0, 0.3), model.encoding.resolutions)
-    occupancy, aim = (occupancy_state(model).to(DEVICE), 0.8), Aim(1e-2, 1.0, 7.0, 0.6)
+    occupancy, aim = (occupancy_state(model).to(DEVICE), 0.8), Aim(1e-2, 1.0, 7.0, torch.tensor(0.6, device=DEVICE))
     pixels = DevicePixels(bank(), DEVICE)
     with torch.device(DEVICE):
         photos = PhotoModel(pixels, sampler, asked or PhotoModelConfig())
@@ -456,7 +456,9 @@ def test_graphed_step_is_the_fits() -> None:
         step.now.fill_(count)
         step.run_eager()
         field = (learnt[0], twin.encoding.resolutions, tuple(learnt[1:]))
-        found = reference.train_step(batch, space, twin.sampler.grid, (0.0, 8.0, 0.3), field, step.aim, into)
+        found = reference.train_step(
+            batch, space, twin.sampler.grid, (0.0, 8.0, 0.3), field, step.aim._replace(nearness=0.6), into
+        )
         assert int(step.samples) == len(found.cells) < step.capacity
         assert float(step.loss) == pytest.approx(found.loss, rel=2e-3)
         for k, parts in enumerate(zip(learnt, into, first, second)):
@@ -494,7 +496,9 @@ def test_photos_learn_from_graphed_steps_as_from_the_fits() -> None:
         lines = origins, directions, batch.rays[2]
         ask = ask._replace(batch=ask.batch._replace(rays=lines, background=batch.background))
         into = [torch.zeros_like(w) for w in (field[0], *field[2])]
-        found = reference.train_step(ask.batch, space, plain.sampler.grid, (0.0, 8.0, 0.3), field, step.aim, into)
+        found = reference.train_step(
+            ask.batch, space, plain.sampler.grid, (0.0, 8.0, 0.3), field, step.aim._replace(nearness=0.6), into
+        )
         truth.learn(ask, found, 0.9, 0.5)
         torch.manual_seed(count)
         step.run_eager()  # the descent's rate is 0

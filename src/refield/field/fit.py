@@ -51,9 +51,10 @@ class FitConfig:
     distortion: float = 1e-2
     """weight of the distortion loss; without it fog fills the grid. Of dim photos less, as their squared errors
     of colour are: times the square of `PixelBank.brightness`"""
-    nearness: float = 0.25
-    """weight, times that of the distortion, of how near to the camera light ends. Haze before what is plain gathers
-    where 1/2 + nearness/4 of the light has ended; where half of it has, which is without it, that is mostly too near"""
+    nearness: float = 0.3
+    """weight, times that of the distortion, of how near to the camera light ends; it falls to none over the first 0.4
+    of a fit. Haze before what is plain gathers where 1/2 + nearness/4 of the light has ended; without it where half of
+    it has, and plain walls and floors end up before the cameras"""
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera"""  # §10.1
     directions: bool = True
@@ -111,6 +112,7 @@ _TRIES, _FIRST_STEP, _LATER_STEPS = 5, 100, (500, 750)
 _FIRST = 0.1  # of its time, in which only steps tell how far it is
 _LATE = 0.3  # of its time; so late a fit does not begin anew
 _BY_HEART = 0.1
+_FORMING = 0.4  # of its time, in which a fit decides how far away things are
 
 
 _Field = TypeVar("_Field")
@@ -299,6 +301,10 @@ class Fitting:
         """Of the learning rate; of a fit that goes on as in the second half of one that begins."""
         return rate_factor((1 + progress) / 2 if self.goes_on else progress)
 
+    def nearness(self, progress: float) -> float:
+        """What it weighs how near light ends. A fit that goes on knows how far away things are."""
+        return 0.0 if self.goes_on else self.config.nearness * max(1 - progress / _FORMING, 0.0)
+
     def may_expose(self, step: int, progress: float) -> None:
         """Find out, when that is due, whether photos are exposed alike."""
         if self.photos.may_expose(max(step / self.config.steps, progress / 2)):
@@ -391,7 +397,7 @@ class _Fit(Fitting):
         asked = self.photos.ask(self.taught.drawn(self.pixels, n), progress)
         model, sampler = self.model, self.model.sampler
         space = (sampler.contraction.centre, sampler.contraction.radius)
-        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP, self.config.nearness)
+        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP, self.nearness(progress))
         field = (model.encoding.tables, model.encoding.resolutions, model.networks)
         where = (space, sampler.grid, sampler.lattice)
         done = kernels.train_step(asked.batch, *where, field, aim, self.adam.grads, fine=sampler.fine)

@@ -115,6 +115,7 @@ class _GpuFit(Fitting):
         self.capacity = _room(config, len(self.pixels))
         self.rays_per_step, self.coarseness = _SIZES[0], COARSEST
         self.finest_step = model.sampler.step
+        self.nearness_now = torch.zeros((), device=device)
 
     def settle(self) -> None:
         self.occupancy.settle(self.pixels)
@@ -148,7 +149,7 @@ class _GpuFit(Fitting):
         """Steps up to the next update of the occupancy grid, and that."""
         graph.now.fill_(self.occupancy.rounds)
         for _ in range(EVERY - step % EVERY):
-            self._set_rate(step)
+            self._set_pace(step)
             graph.replay()
             self._learn(graph, step)
             step += 1
@@ -164,14 +165,14 @@ class _GpuFit(Fitting):
         sampler = replace(self.model.sampler, step=self.finest_step * self.coarseness)
         self.model.sampler = sampler
         space = (sampler.contraction.centre, sampler.contraction.radius)
-        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP, self.config.nearness)
+        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP, self.nearness_now)
         where = (space, self.grid, sampler.lattice, self.model.encoding.resolutions)
         occupancy = (self.occupancy.state, DECAY)
         graph = GraphedStep(self.descent, self.photos, where, aim, occupancy, (self.rays_per_step, self.capacity))
         graph.progress = self._expose(step)
         graph.plain = self.plain and self.photos.plain(graph.progress)
         graph.now.fill_(self.occupancy.rounds)
-        self._set_rate(step)
+        self._set_pace(step)
         return graph, step + graph.capture()
 
     def _expose(self, step: int) -> float:
@@ -186,8 +187,10 @@ class _GpuFit(Fitting):
         progress = self.progress(step)
         self.photos.learn(graph.asked, graph.found, progress, self.rate_factor(progress))
 
-    def _set_rate(self, step: int) -> None:
+    def _set_pace(self, step: int) -> None:
+        """What changes from step to step, where graphs read it."""
         self.descent.rate.fill_(self._rate(step))
+        self.nearness_now.fill_(self.nearness(self.progress(step)))
 
     def _rate(self, step: int) -> float:
         return self.config.rate * self.rate_factor(self.progress(step))

@@ -56,8 +56,8 @@ class Aim(NamedTuple):
     """gradients of samples nearer than this, world units, are scaled down by the square of their distance (§10.1)"""
     stop: float
     """optical depth at which a ray ends"""
-    nearness: float = 0.0
-    """weight, times that of the distortion, of how near to the camera light ends"""
+    nearness: float | Tensor = 0.0
+    """weight, times that of the distortion, of how near to the camera light ends; a tensor () where a graph reads it"""
 
 
 class Stepped(NamedTuple):

@@ -204,8 +204,8 @@ def after_march(
 
 def toward(aim: Aim, space: Space, rays: int) -> tuple[np.float32, ...]:
     """What the loops want to know of the aim."""
-    radius, strength, unit, count, nearness = map(
-        np.float32, (space[1], aim.distortion, aim.gradient_unit, rays, aim.nearness)
+    radius, strength, unit, count, nearness = (
+        np.float32(x) for x in (space[1], aim.distortion, aim.gradient_unit, rays, float(aim.nearness))
     )
     return radius, strength, unit, count, nearness
 
