@@ -20,7 +20,7 @@ from refield.field import kernels
 from refield.field.compiling import compiling
 from refield.field.descent import MOST_SKIPPED, NonFiniteError
 from refield.field.encoding import Contraction
-from refield.field.fit import FitConfig, FitProgress, _Fit, fit_field
+from refield.field.fit import FitConfig, FitProgress, Fitting, _Fit, fit_field
 from refield.field.memory import memory_of
 from refield.field.photos import HeldOut, Photos, Since
 from refield.field.pixels import PixelBank
@@ -281,6 +281,13 @@ def test_what_is_learnt_by_heart_is_noticed_at_two_steps(
         fit.judge = SimpleNamespace(psnr=lambda *_, seen=left_out: seen)
         found.append(_Fit._stuck(fit, 1))
     assert found == verdicts
+
+
+def test_how_near_light_ends_counts_while_a_fit_forms() -> None:
+    fit, onward = (SimpleNamespace(goes_on=goes_on, config=FitConfig(nearness=0.3)) for goes_on in (False, True))
+    weights = [Fitting.nearness(fit, progress) for progress in (0.0, 0.2, 0.4, 1.0)]  # type: ignore[arg-type]
+    assert weights == pytest.approx([0.3, 0.15, 0.0, 0.0])
+    assert Fitting.nearness(onward, 0.0) == 0  # type: ignore[arg-type]
 
 
 def test_learning_rate_is_held_then_falls() -> None:
