@@ -1,15 +1,18 @@
 """Why a scene's change was told wrong: was the right answer not tried, or did it cost more than what was told?
 
     python benchmarks/gauntlet.py --seeds 300..309 --keep      # scenes whose truth is known, with their workspaces
-    python benchmarks/diagnose.py build/gauntlet/0300          # one line for each, and a picture
+    python benchmarks/diagnose.py build/gauntlet/0300          # a row of a table for each, and a picture
 
-The estimate is asked again (the workspace's field as it was fitted), and then the hypothesis that is true: each
-object's true voxels, each pose refined from the true one. Where the true hypothesis costs less than the one told, the
-search did not find it; where it costs more, the photos say something else than the likelihood makes of them.
+The estimate is asked again (the workspace's field as it was fitted), and then the hypothesis that is true: each thing
+by its true voxels, each pose refined from the true one. Where the true hypothesis costs less than the one told, the
+search did not find it; where it costs more, the photos say something else than the likelihood makes of them. What of
+the truth the likelihood does not take (a thing that left or arrived and explains less than it costs, a move that cannot
+be seen) is named as missing: the cost is then that of the rest.
 
 Of a scene NAME, NAME.png in ``--out`` shows for each new photo, from left to right: the photo, the old field, what was
-told and its costs, what is true and its costs (white: as wrong as nothing is), and what is not explained if nothing
-changed.
+told without its newcomers and its costs, the same of what is true, and the costs if nothing changed. Costs are black
+where the photo is as it should be and white where it is twice as wrong as a pose may be, or more; blue where anything
+may be.
 """
 
 from __future__ import annotations
@@ -17,18 +20,23 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
 from gauntlet.match import pose_row, true_objects
+from gauntlet.row import facts_of, symmetric
 from PIL import Image
 
 from refield.estimate import recipe
+from refield.estimate.arrive import shadow_of
+from refield.estimate.associate import without
+from refield.estimate.cost import CAME
+from refield.estimate.lattice import Body, Lattice
 from refield.estimate.layers import Sight
 from refield.estimate.likelihood import Settled, _before, _left, judged
 from refield.estimate.look import Array
@@ -39,126 +47,122 @@ from refield.estimate.settle import Search
 from refield.field.source import Known
 from refield.rehearse.matching import matched
 from refield.scene.capture import centres
-from refield.scene.change import ObjectChange, SceneChange
+from refield.scene.change import ObjectChange, OccupancyGrid, SceneChange
 from refield.scene.errors import InputError
 from refield.scene.files import read_json
 from refield.scene.load import load_new_photos
 from refield.workspace import Workspace
 
+COLUMNS = ("scene", "seconds", "true and told", "cost: nothing", "told", "true", "of the truth", "missing of it")
 SIDE = 240
 """pixels of a photo's longer side in the picture"""
 
-
-@dataclass
-class Watch:
-    """What was searched while an estimate ran."""
-
-    search: list[Search] = field(default_factory=list)
-    settled: list[Settled] = field(default_factory=list)
+Row = dict[str, Any]
 
 
-@contextmanager
-def watched() -> Iterator[Watch]:
-    """Keep the search of whatever is estimated meanwhile, and the hypothesis that it ended with."""
-    watch, real = Watch(), recipe.Search
-
-    class Watched(real):  # type: ignore[misc, valid-type]
-        def turned(self, told: Settled) -> Settled:
-            settled = super().turned(told)
-            watch.search.append(self)
-            watch.settled.append(settled)
-            return settled
-
-    recipe.Search = Watched  # type: ignore[misc]
-    try:
-        yield watch
-    finally:
-        recipe.Search = real  # type: ignore[misc]
-
-
-def diagnosed(folder: Path, out: Path) -> dict[str, Any]:
+def diagnosed(folder: Path, out: Path) -> Row:
     """One scene's truth, what is told of it, and what both cost."""
     workspace, true = Workspace.open(folder / "work"), true_objects(folder / "data")
     if true is None:
         raise InputError(folder, "nothing is known of what is true there", "give a scene of the gauntlet")
-    capture, began = workspace.capture(), time.perf_counter()
-    frames = load_new_photos(folder / "data" / "after", capture)
-    with watched() as watch:
+    capture, began, kept = workspace.capture(), time.perf_counter(), list[tuple[Search, Settled]]()
+    frames, really = load_new_photos(folder / "data" / "after", capture), recipe.Search.turned
+
+    def turned(search: Search, told: Settled) -> Settled:
+        kept.append((search, really(search, told)))
+        return kept[-1][1]
+
+    with patch.object(recipe.Search, "turned", turned):
         try:
             change = recipe.estimate_change(capture, workspace.field(), frames)
         except InputError as error:
-            return {"scene": folder.name, "refused": str(error)}
-    row: dict[str, Any] = {"scene": folder.name, "seconds": round(time.perf_counter() - began)}
-    row |= _told(change, true, folder)
-    if watch.search:
-        search, told = watch.search[-1], watch.settled[-1]
-        right = truly(search, true)
-        told, costs = judged(search.ground, told)
-        right, would = judged(search.ground, right)
-        nothing = judged(search.ground, search._hypothesis(dict(enumerate(told.olds)), [], {}))
-        row |= {"cost told": round(costs), "cost true": round(would), "cost of nothing": round(nothing[1])}
-        row["true, as judged"] = _kinds(right)
-        _picture(search, (told, right, nothing[0]), out / f"{folder.name}.png")
+            return {"scene": folder.name, "true and told": f"refused: {error}"}
+    facts = read_json(folder / "data" / "truth" / "world.json") if (folder / "data" / "truth").is_dir() else {}
+    row: Row = {"scene": folder.name, "seconds": round(time.perf_counter() - began)}
+    row["true and told"] = "; ".join(_told(change, true, facts))
+    if not kept:
+        return row
+    search, told = kept[-1]
+    nothing = search._hypothesis(dict(enumerate(told.olds)), [], {})
+    asked = {"cost: nothing": _without_newcomers(nothing), "told": told, "true": truly(search, true)}
+    found = {name: judged(search.ground, one) for name, one in asked.items()}
+    row |= {name: round(cost) for name, (_, cost) in found.items()}
+    right = found["true"][0]
+    row["of the truth"] = "; ".join(_shown(right))
+    lacks = Counter(t.kind for t in true) - Counter(_kinds(right))
+    row["missing of it"] = ", ".join(lacks.elements())
+    _picture(search, [one for one, _ in found.values()], out / f"{folder.name}.png")
     return row
 
 
-def _told(change: SceneChange, true: Sequence[ObjectChange], folder: Path) -> dict[str, Any]:
-    facts = folder / "data" / "truth" / "world.json"
-    of = [o for o in (read_json(facts) if facts.is_file() else {}).get("objects", []) if o["change"] != "none"]
-    of.sort(key=lambda o: o["change"] == "added")
-    pairs, lines = matched(change.objects, true).pairs, []
+def _without_newcomers(settled: Settled) -> Settled:
+    return Settled(views=settled.views, olds=settled.olds)
+
+
+def _told(change: SceneChange, true: Sequence[ObjectChange], facts: Row) -> list[str]:
+    """Of each true object what was told, and what was told beside them."""
+    match, things, unseen = matched(change.objects, true), facts_of(facts, len(true)), symmetric(facts, len(true))
+    lines = []
     for k, t in enumerate(true):
-        found = change.objects[pairs[k]] if k in pairs else None
-        line = " ".join([t.kind, *([of[k]["family"], of[k]["texture"]] if len(of) == len(true) else []), "->"])
-        line += " nothing" if found is None else f" {found.kind} ({found.confidence:.2f})"
+        name = f"{things[k]['texture']} {things[k]['family']} " if things else ""
+        found = change.objects[match.pairs[k]] if k in match.pairs else None
+        line = f"{name}{t.kind}: nothing" if found is None else f"{name}{t.kind}: {found.kind}, {found.confidence:.2f}"
         off = {} if found is None else pose_row(found, t, centres(change.frames))
-        line += f" {off['off, % of distance']:.2f} %, {off['off, °']:.1f}°" if off else ""
+        line += f", {off['off, % of distance']:.2f} %" if off else ""
+        line += f", {off['off, °']:.1f}°" if off and k not in unseen else ""
         lines.append(line)
-    false = [o for i, o in enumerate(change.objects) if i not in pairs.values()]
-    lines += [f"false {o.kind} ({o.confidence:.2f})" for o in false]
-    return {"objects": lines, "not understood": bool(change.unexplained)}
+    beside = [("false", match.false), ("a piece", match.pieces)]
+    lines += [f"{how}: {change.objects[i].kind}, {change.objects[i].confidence:.2f}" for how, of in beside for i in of]
+    return lines + ["not understood"] * bool(change.unexplained)
 
 
 def truly(search: Search, true: Sequence[ObjectChange]) -> Settled:
-    """The hypothesis that is true: all that moved or left by its true voxels, at the refined true poses."""
-    ground, olds, moved = search.ground, list[Old](), dict[int, PoseChange]()
-    poses: dict[int, torch.Tensor] = {}
+    """The hypothesis that is true, as far as the estimate tells of moves and departures by themselves."""
+    ground, olds, poses = search.ground, list[Old](), dict[int, torch.Tensor]()
     for o in true:
-        if o.kind == "added":
-            continue
-        old = remembered(ground.field, ground.photographed, Known(o.grid), ground.planes, ground.shape)
-        if old is None:
-            continue
-        if o.new_from_old is not None:
-            poses[len(olds)] = o.new_from_old.double()
-        olds.append(replace(old, remembered=False))
+        known = None if o.kind == "added" else Known(o.grid)
+        old = known and remembered(ground.field, ground.photographed, known, ground.planes, ground.shape)
+        if old:
+            if o.new_from_old is not None:
+                poses[len(olds)] = o.new_from_old.double()
+            olds.append(old)
+    moved = dict[int, PoseChange]()
     for k, pose in poses.items():
-        views = ground.past(search.changed, olds)
+        views = without(ground, search.changed, olds, [(olds[j], change) for j, change in moved.items()])
         change = refine(Sight(ground.field, olds[k], views, olds), pose, ground.fine, FINER)
         if change is not None:
             moved[k] = change
-    return search._hypothesis(dict(enumerate(olds)), list(range(len(olds))), moved)
+    told = search._hypothesis(dict(enumerate(olds)), range(len(olds)), moved)
+    came = tuple(_body(o.grid, ground.carving.longest) for o in true if o.kind == "added")
+    return Settled(told.moved, told.removed, came, told.views, told.olds, told.touched)
 
 
-def _kinds(settled: Settled) -> str:
-    moved = [f"moved, {100 * c.explained:.0f} % shown (before {100 * c.before:.0f})" for c in settled.moved.values()]
-    left = [f"left ({100 * share:.0f} %)" for share in settled.removed.values()]
-    return "; ".join([*moved, *left, *(f"arrived ({came:.2f})" for came in settled.came)])
+def _body(grid: OccupancyGrid, longest: int) -> Body:
+    lattice = Lattice.over(*grid.tight_aabb().numpy(), longest)
+    return Body(lattice, grid.contains(torch.from_numpy(lattice.centres)).numpy())
 
 
-def _picture(search: Search, hypotheses: tuple[Settled, Settled, Settled], path: Path) -> None:
-    """Photo, old field, the told and the true composite with their costs, and the costs if nothing changed."""
-    told, right, nothing = hypotheses
+def _kinds(settled: Settled) -> list[str]:
+    return ["moved"] * len(settled.moved) + ["removed"] * len(settled.removed) + ["added"] * len(settled.arrived)
+
+
+def _shown(settled: Settled) -> list[str]:
+    moved = [f"moved, shown {c.explained:.2f} (before {c.before:.2f})" for c in settled.moved.values()]
+    left = [f"removed, {share:.2f} show what was behind" for share in settled.removed.values()]
+    return [*moved, *left, *(f"added, {came:.2f}" for came in settled.came)]
+
+
+def _picture(search: Search, hypotheses: Sequence[Settled], path: Path) -> None:
+    nothing, told, right = hypotheses
     rows = []
     for i, changed in enumerate(search.changed):
-        view = changed.view
-        tiles = [view.photo, view.rgb]
+        tiles = [changed.view.photo, changed.view.rgb]
         for one in (told, right):
             tiles += [_composite(search, one, i), _costs(search, one, i)]
-        tiles.append(_costs(search, nothing, i))
-        rows.append(np.concatenate([_tile(t) for t in tiles], 1))
+        rows.append(np.concatenate([_tile(t) for t in (*tiles, _costs(search, nothing, i))], 1))
+    width = max(row.shape[1] for row in rows)
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.concatenate(rows)).save(path)
+    Image.fromarray(np.concatenate([np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0))) for r in rows])).save(path)
 
 
 def _composite(search: Search, one: Settled, i: int) -> Array:
@@ -170,11 +174,15 @@ def _composite(search: Search, one: Settled, i: int) -> Array:
 
 
 def _costs(search: Search, one: Settled, i: int) -> Array:
-    left, tells, _ = _left(search.ground, one, one.views[i])
+    p = one.views[i]
+    left, tells, _ = _left(search.ground, one, p)
+    for body in one.arrived:
+        here = shadow_of(p.view, body, p.depth)
+        left, tells = np.where(here, CAME, left), tells & ~here
     return np.stack([left / 2, left / 2, np.where(tells, left / 2, 1)], -1)
 
 
-def _tile(picture: Array) -> Any:
+def _tile(picture: Array) -> Array:
     tile = Image.fromarray((np.clip(picture, 0, 1) * 255).astype(np.uint8))
     scale = SIDE / max(tile.size)
     return np.asarray(tile.resize((round(tile.width * scale), round(tile.height * scale)), Image.Resampling.NEAREST))
@@ -185,10 +193,14 @@ def main() -> int:
     parser.add_argument("folders", type=Path, nargs="+", help="scenes of the gauntlet, kept")
     parser.add_argument("--out", type=Path, default=Path("build/diagnosed"), help="pictures")
     arguments = parser.parse_args()
+    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     for folder in arguments.folders:
-        for name, value in diagnosed(folder, arguments.out).items():
-            print(f"{name}: {value}", flush=True)
-        print(flush=True)
+        try:
+            row = diagnosed(folder, arguments.out)
+        except InputError as error:
+            print(f"diagnose: {error}", file=sys.stderr)
+            return 2
+        print(f"| {' | '.join(str(row.get(name, '')) for name in COLUMNS)} |", flush=True)
     return 0
 
 

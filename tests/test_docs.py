@@ -15,7 +15,7 @@ import pytest
 
 import refield
 from refield.cli import COMMANDS
-from refield.field.fit import FitConfig
+from refield.field.fit import _FORMING, FitConfig
 from refield.field.fit_nerfacto import REDUCED, NerfactoFitConfig
 from refield.update.config import UpdateConfig
 from refield.update.paper.config import PaperUpdateConfig, reduced
@@ -109,6 +109,7 @@ def test_numbers_of_the_method_are_those_that_are_used() -> None:
     assert f"{REDUCED.steps} steps of {REDUCED.rays} rays" in told
     weights = {FitConfig().distortion, update.fit.distortion}
     assert weights == {0.01} and f"is 0.01 for our field and the helper, nerfstudio's {fit.distortion:g}" in told
+    assert f"over the first {_FORMING:g} of a fit" in told
 
 
 def test_what_nobody_runs_is_found_to_be_so() -> None:

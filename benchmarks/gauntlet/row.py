@@ -114,15 +114,19 @@ def _objects(change: SceneChange | None, true: Sequence[ObjectChange], facts: Ro
     }
 
 
-def symmetric(facts: Row, count: int) -> set[int]:
-    """Indices of the ``count`` true objects whose turn cannot be seen: round ones of one colour.
+def facts_of(facts: Row, count: int) -> list[Row]:
+    """What the facts tell of each of the ``count`` true objects, in their order; nothing where that is not known.
 
-    The facts tell of each thing in the scene; true objects that were there come first, then what arrived.
+    They tell of each thing in the scene; true objects that were there come first, then what arrived.
     """
     changed = [o for o in facts.get("objects", []) if o["change"] != "none"]
     changed.sort(key=lambda o: o["change"] == "added")
-    if len(changed) != count:
-        return set()
+    return changed if len(changed) == count else []
+
+
+def symmetric(facts: Row, count: int) -> set[int]:
+    """Indices of the ``count`` true objects whose turn cannot be seen: round ones of one colour."""
+    changed = facts_of(facts, count)
     return {i for i, o in enumerate(changed) if o["family"] in _ROUND and o["texture"] == _PLAIN}
 
 

@@ -20,7 +20,7 @@ from refield.field import kernels
 from refield.field.compiling import compiling
 from refield.field.descent import MOST_SKIPPED, NonFiniteError
 from refield.field.encoding import Contraction
-from refield.field.fit import FitConfig, FitProgress, Fitting, _Fit, fit_field
+from refield.field.fit import FitConfig, FitProgress, _Fit, fit_field
 from refield.field.memory import memory_of
 from refield.field.photos import HeldOut, Photos, Since
 from refield.field.pixels import PixelBank
@@ -283,11 +283,17 @@ def test_what_is_learnt_by_heart_is_noticed_at_two_steps(
     assert found == verdicts
 
 
-def test_how_near_light_ends_counts_while_a_fit_forms() -> None:
-    fit, onward = (SimpleNamespace(goes_on=goes_on, config=FitConfig(nearness=0.3)) for goes_on in (False, True))
-    weights = [Fitting.nearness(fit, progress) for progress in (0.0, 0.2, 0.4, 1.0)]  # type: ignore[arg-type]
-    assert weights == pytest.approx([0.3, 0.15, 0.0, 0.0])
-    assert Fitting.nearness(onward, 0.0) == 0  # type: ignore[arg-type]
+def test_how_near_light_ends_counts_while_a_fit_forms(
+    capture: Capture, fitted: tuple[HashField, list[FitProgress]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+    whole = kernels.train_step
+    monkeypatch.setattr(kernels, "train_step", lambda *a, **k: (asked.append(a[5].nearness), whole(*a, **k))[1])
+    fit_field(capture, replace(TINY, steps=10))
+    assert asked == pytest.approx([0.3 * max(1 - step / 4, 0) for step in range(10)])
+    asked.clear()
+    fit_field(capture, replace(TINY, steps=3), start=fitted[0])  # it knows how far away things are
+    assert asked == [0, 0, 0]
 
 
 def test_learning_rate_is_held_then_falls() -> None:

@@ -550,6 +550,8 @@ def test_the_loop_gives_up_and_goes_on_as_on_a_cpu(tmp_path: Path, monkeypatch: 
         return 1
 
     small_steps(monkeypatch, eager)
+    nearness, step = list[float](), gpu.train_step
+    monkeypatch.setattr(gpu, "train_step", lambda *a, **k: (nearness.append(float(a[5].nearness)), step(*a, **k))[1])
     capture, config = room(tmp_path), FitConfig(steps=6)
     rates: list[float] = []
     whole = Descent.step
@@ -558,6 +560,7 @@ def test_the_loop_gives_up_and_goes_on_as_on_a_cpu(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(Fitting, "_stuck", lambda fit, within: asked.append(fit.steps_done) or within != 3)
     loop(capture, config).run(may_give_up=True)
     assert asked == [3, 6] and max(rates) == pytest.approx(config.rate)
+    assert nearness == pytest.approx([config.nearness * max(1 - k / 6 / 0.4, 0) for k in range(6)])
     rates.clear()
     loop(capture, config, goes_on=True).run()
     assert asked == [3, 6] and config.rate / 40 < min(rates) and max(rates) < 1.001 * config.rate

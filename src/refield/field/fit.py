@@ -53,8 +53,8 @@ class FitConfig:
     of colour are: times the square of `PixelBank.brightness`"""
     nearness: float = 0.3
     """weight, times that of the distortion, of how near to the camera light ends; it falls to none over the first 0.4
-    of a fit. Haze before what is plain gathers where 1/2 + nearness/4 of the light has ended; without it where half of
-    it has, and plain walls and floors end up before the cameras"""
+    of a fit, and is none in a fit that begins from a field. Haze before what is plain gathers where 1/2 + nearness/4 of
+    the light has ended; without it where half of it has, and plain walls and floors end up before the cameras"""
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera"""  # §10.1
     directions: bool = True
@@ -177,6 +177,8 @@ def fit_capture(
     check_capture(capture)
     expect("the config of a fit", config, FitConfig, "a refield.field.fit.FitConfig")
     capture, since = as_read(capture, since, config.size)
+    if start is not None:  # it knows how far away things are
+        config = replace(config, nearness=0.0)
     on_gpu = config.device == "cuda"
     if on_gpu:
         _check_gpu(config, since)
@@ -302,8 +304,8 @@ class Fitting:
         return rate_factor((1 + progress) / 2 if self.goes_on else progress)
 
     def nearness(self, progress: float) -> float:
-        """What it weighs how near light ends. A fit that goes on knows how far away things are."""
-        return 0.0 if self.goes_on else self.config.nearness * max(1 - progress / _FORMING, 0.0)
+        """What it weighs how near light ends."""
+        return self.config.nearness * max(1 - progress / _FORMING, 0.0)
 
     def may_expose(self, step: int, progress: float) -> None:
         """Find out, when that is due, whether photos are exposed alike."""

@@ -58,8 +58,8 @@ def train_step(
         errors = compared(shown, batch)
         s0, s1 = (t / (t + space[1]) for t in (t0, t1))
         off = errors.square().mean(-1)
-        near_ends = accumulate(w, (1 - (s0 + s1) / 2)[:, None], offsets)[:, 0]
-        spread = aim.distortion * (distortion(w, s0, s1, offsets) + aim.nearness * near_ends)
+        nearness = accumulate(w, (1 - (s0 + s1) / 2)[:, None], offsets)[:, 0]
+        spread = aim.distortion * (distortion(w, s0, s1, offsets) + aim.nearness * nearness)
         each = (off if batch.trust is None else batch.trust * off) + spread
         loss = (share * each).sum()
     grads = torch.autograd.grad(loss, leaves + (ways if batch.moving else []))
