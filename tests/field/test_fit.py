@@ -289,10 +289,10 @@ def test_how_near_light_ends_counts_while_a_fit_forms(
     asked: list[float] = []
     whole = kernels.train_step
     monkeypatch.setattr(kernels, "train_step", lambda *a, **k: (asked.append(a[5].nearness), whole(*a, **k))[1])
-    fit_field(capture, replace(TINY, steps=10))
+    fit_field(capture, replace(TINY, steps=10, nearness=0.3))
     assert asked == pytest.approx([0.3 * max(1 - step / 4, 0) for step in range(10)])
     asked.clear()
-    fit_field(capture, replace(TINY, steps=3), start=fitted[0])  # it knows how far away things are
+    fit_field(capture, replace(TINY, steps=3, nearness=0.3), start=fitted[0])  # it knows how far away things are
     assert asked == [0, 0, 0]
 
 

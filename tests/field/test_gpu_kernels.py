@@ -552,7 +552,7 @@ def test_the_loop_gives_up_and_goes_on_as_on_a_cpu(tmp_path: Path, monkeypatch: 
     small_steps(monkeypatch, eager)
     nearness, step = list[float](), gpu.train_step
     monkeypatch.setattr(gpu, "train_step", lambda *a, **k: (nearness.append(float(a[5].nearness)), step(*a, **k))[1])
-    capture, config = room(tmp_path), FitConfig(steps=6)
+    capture, config = room(tmp_path), FitConfig(steps=6, nearness=0.3)
     rates: list[float] = []
     whole = Descent.step
     monkeypatch.setattr(Descent, "step", lambda d, loss: (rates.append(float(d.rate)), whole(d, loss))[1])

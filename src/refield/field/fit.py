@@ -51,10 +51,11 @@ class FitConfig:
     distortion: float = 1e-2
     """weight of the distortion loss; without it fog fills the grid. Of dim photos less, as their squared errors
     of colour are: times the square of `PixelBank.brightness`"""
-    nearness: float = 0.3
+    nearness: float = 0.0
     """weight, times that of the distortion, of how near to the camera light ends; it falls to none over the first 0.4
     of a fit, and is none in a fit that begins from a field. Haze before what is plain gathers where 1/2 + nearness/4 of
-    the light has ended; without it where half of it has, and plain walls and floors end up before the cameras"""
+    the light has ended; where half of it has, plain walls and floors may end up before the cameras. Try 0.3 for a place
+    that is mostly plain and has many photos; of few photos all may sink away behind itself"""
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera"""  # §10.1
     directions: bool = True
