@@ -22,6 +22,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -77,14 +78,15 @@ def diagnosed(folder: Path, out: Path) -> Row:
             change = recipe.estimate_change(capture, workspace.field(), frames)
         except InputError as error:
             return {"scene": folder.name, "true and told": f"refused: {error}"}
-    facts = read_json(folder / "data" / "truth" / "world.json") if (folder / "data" / "truth").is_dir() else {}
+    world = folder / "data" / "truth" / "world.json"
+    facts = read_json(world) if world.is_file() else {}
     row: Row = {"scene": folder.name, "seconds": round(time.perf_counter() - began)}
     row["true and told"] = "; ".join(_told(change, true, facts))
     if not kept:
         return row
     search, told = kept[-1]
-    nothing = search._hypothesis(dict(enumerate(told.olds)), [], {})
-    asked = {"cost: nothing": _without_newcomers(nothing), "told": told, "true": truly(search, true)}
+    nothing = Settled(views=tuple(without(search.ground, search.changed, [])))
+    asked = {"cost: nothing": nothing, "told": told, "true": truly(search, true)}
     found = {name: judged(search.ground, one) for name, one in asked.items()}
     row |= {name: round(cost) for name, (_, cost) in found.items()}
     right = found["true"][0]
@@ -93,10 +95,6 @@ def diagnosed(folder: Path, out: Path) -> Row:
     row["missing of it"] = ", ".join(lacks.elements())
     _picture(search, [one for one, _ in found.values()], out / f"{folder.name}.png")
     return row
-
-
-def _without_newcomers(settled: Settled) -> Settled:
-    return Settled(views=settled.views, olds=settled.olds)
 
 
 def _told(change: SceneChange, true: Sequence[ObjectChange], facts: Row) -> list[str]:
@@ -134,7 +132,7 @@ def truly(search: Search, true: Sequence[ObjectChange]) -> Settled:
             moved[k] = change
     told = search._hypothesis(dict(enumerate(olds)), range(len(olds)), moved)
     came = tuple(_body(o.grid, ground.carving.longest) for o in true if o.kind == "added")
-    return Settled(told.moved, told.removed, came, told.views, told.olds, told.touched)
+    return replace(told, arrived=came)
 
 
 def _body(grid: OccupancyGrid, longest: int) -> Body:

@@ -165,7 +165,8 @@ class _GpuFit(Fitting):
         sampler = replace(self.model.sampler, step=self.finest_step * self.coarseness)
         self.model.sampler = sampler
         space = (sampler.contraction.centre, sampler.contraction.radius)
-        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP, self.nearness_now)
+        nearness = self.nearness_now if self.config.nearness else 0.0
+        aim = Aim(self.distortion, self.config.gradient_unit * space[1], STOP, nearness)
         where = (space, self.grid, sampler.lattice, self.model.encoding.resolutions)
         occupancy = (self.occupancy.state, DECAY)
         graph = GraphedStep(self.descent, self.photos, where, aim, occupancy, (self.rays_per_step, self.capacity))

@@ -58,9 +58,10 @@ def train_step(
         errors = compared(shown, batch)
         s0, s1 = (t / (t + space[1]) for t in (t0, t1))
         off = errors.square().mean(-1)
-        nearness = accumulate(w, (1 - (s0 + s1) / 2)[:, None], offsets)[:, 0]
-        spread = aim.distortion * (distortion(w, s0, s1, offsets) + aim.nearness * nearness)
-        each = (off if batch.trust is None else batch.trust * off) + spread
+        spread = distortion(w, s0, s1, offsets)
+        if torch.is_tensor(aim.nearness) or aim.nearness:  # most steps ask for none; a graph's is not known here
+            spread = spread + aim.nearness * accumulate(w, (1 - (s0 + s1) / 2)[:, None], offsets)[:, 0]
+        each = (off if batch.trust is None else batch.trust * off) + aim.distortion * spread
         loss = (share * each).sum()
     grads = torch.autograd.grad(loss, leaves + (ways if batch.moving else []))
     for total, grad in zip(into, grads):
