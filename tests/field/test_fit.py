@@ -17,6 +17,7 @@ from numba.core import event
 from PIL import Image
 
 from refield.field import kernels
+from refield.field.attempts import ENDLESS, Attempts, Patience, StuckError
 from refield.field.compiling import compiling
 from refield.field.descent import MOST_SKIPPED, NonFiniteError
 from refield.field.encoding import Contraction
@@ -138,23 +139,23 @@ def test_held_out_views_are_explained(capture: Capture, fitted: tuple[HashField,
 
 def test_a_fit_that_leads_nowhere_begins_anew(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     short = replace(TINY, steps=20, check_every=20, field=replace(TINY.field, levels=2, log2_table=8))
+    monkeypatch.setattr("refield.field.fit.ASKED", (1, 3, 5))
     other = fit_field(capture, replace(short, seed=short.seed + 1))
     asked: list[int] = []
-    monkeypatch.setattr(_Fit, "_stuck", lambda fit, within: asked.append(fit.steps_done) or (len(asked) == 5))
+    monkeypatch.setattr(Patience, "ends", lambda patience, step, *_: asked.append(step) or len(asked) == 2)
     again = fit_field(capture, short)
-    assert asked == [1, 2, 3, 4, 5, *range(1, 21)]
+    assert asked == [3, 5, 3, 5]  # the first look is no question
     assert all(torch.equal(a, b) for a, b in zip(again.parameters(), other.parameters()))
     with monkeypatch.context() as patch:
-        patch.setattr(_Fit, "_stuck", lambda fit, within: True)
-        told = iter([1.0, 3.0, 2.0, 0.0])
+        patch.setattr(Patience, "ends", lambda *_: True)
+        told = iter([0.0, 1.0, 0.0, 3.0, 0.0, 2.0, 0.0, 0.0])
         patch.setattr(HeldOut, "psnr", lambda judge, model, exposed=False: next(told, 0.0))
         last = fit_field(capture, short)  # of four that were given up the best is fitted to its end
     assert all(torch.equal(a, b) for a, b in zip(last.parameters(), other.parameters()))
     asked.clear()
-    monkeypatch.setattr(_Fit, "_stuck", lambda fit, within: asked.append(fit.steps_done) is None)
-    monkeypatch.setattr("refield.field.fit._LATE", 0.0)
+    monkeypatch.setattr("refield.field.fit.LATE", 0.0)
     fit_field(capture, short)
-    assert asked == [*range(1, 21)]  # too late to begin anew: it goes on with what it has
+    assert asked == []  # too late to begin anew: it goes on with what it has
 
 
 def attempts(capture: Capture, config: FitConfig) -> int:
@@ -183,17 +184,18 @@ def test_photos_learnt_by_heart_are_begun_anew(capture: Capture, tmp_path: Path)
         return torch.nn.functional.interpolate(blocks, photo.shape[:2], mode="bilinear")[0].permute(1, 2, 0)
 
     few = replace(capture, frames=capture.frames[:20])
-    short = replace(TINY, steps=510, samples=1024, check_every=1000, field=replace(TINY.field, levels=4))
+    short = replace(TINY, steps=510, samples=1024, check_every=1000, field=replace(TINY.field, levels=4), nearness=0.0)
     assert attempts(rephotographed(few, tmp_path, unrelated), short) == 5
 
 
-def test_bad_photos_of_a_scene_are_fitted_once(capture: Capture, tmp_path: Path) -> None:
+def test_bad_photos_of_a_scene_are_not_taken_for_foam(capture: Capture, tmp_path: Path) -> None:
     """Grain that no field can explain: the error stays large, and hardly falls once the scene is learnt."""
 
     def grainy(photo: torch.Tensor, i: int) -> torch.Tensor:
         return photo + 0.2 * torch.randn(photo.shape, generator=torch.Generator().manual_seed(i))
 
-    assert attempts(rephotographed(capture, tmp_path, grainy), replace(TINY, steps=510, check_every=1000)) == 1
+    config = replace(TINY, steps=510, check_every=1000, nearness=0.0)
+    assert attempts(rephotographed(capture, tmp_path, grainy), config) == 1
 
 
 def test_same_seed_same_field(capture: Capture) -> None:
@@ -268,19 +270,68 @@ def test_a_rig_that_looks_one_way_is_placed_by_its_points(capture: Capture) -> N
         ([(100, 23.3, 26.8), (500, 32.4, 32.7), (750, 33.6, 33.4)], [False, False, False]),
         ([(100, 22.0, 20.0), (500, 30.0, 20.3)], [False, True]),
         ([(100, 22.0, 20.0), (499, 30.0, 20.3), (1000, 33.0, 20.0)], [False, False, False]),  # not asked then
+        ([(100, 22.0, 24.1), (400, 25.6, 25.3), (500, 25.9, 25.1)], [False, True, False]),  # a plain floor too near
+        ([(100, 22.0, 23.8), (400, 28.2, 27.3)], [False, False]),  # a sound one
+        ([(100, 22.0, math.nan), (400, 30.0, math.nan), (500, 31.0, math.nan)], [False, False, False]),
     ],
 )
-def test_what_is_learnt_by_heart_is_noticed_at_two_steps(
+def test_what_is_learnt_by_heart_is_noticed_at_three_steps(
     looks: list[tuple[int, float, float]], verdicts: list[bool]
 ) -> None:
     """Steps done, PSNR of the photos that teach and of those left out; the first two are two seeds of one world."""
-    fit: Any = SimpleNamespace(first=None, model=SimpleNamespace(train=lambda: None))
+    fit: Any = SimpleNamespace(first=None, model=SimpleNamespace(train=lambda: None), progress=lambda step: 0.0)
     fit.photos, found = SimpleNamespace(exposing=False), []
     for step, taught, left_out in looks:
         fit.steps_done, fit.loss = step, 10 ** (-taught / 10)
         fit.judge = SimpleNamespace(psnr=lambda *_, seen=left_out: seen)
-        found.append(_Fit._stuck(fit, 1))
+        try:
+            _Fit.give_up_if_stuck(fit, Attempts(None, True).patience)
+            found.append(False)
+        except StuckError as error:
+            assert (error.left_out, error.doubted) == (left_out, step == 400)
+            found.append(True)
     assert found == verdicts
+
+
+def test_two_ways_to_weigh_how_near_light_ends_are_compared_by_photos_left_out() -> None:
+    def doubted(attempts: Attempts, left_out: float, gained: tuple[float, float] = (1.0, 4.0)) -> bool:
+        return attempts.patience.ends(400, left_out, gained)
+
+    better, worse = Attempts(None, True), Attempts(None, True)
+    for attempts in (better, worse):
+        assert attempts.nearness == 0 and doubted(attempts, 24.0) and not doubted(attempts, 24.0, (2.0, 4.0))
+        attempts.give_up(StuckError(24.0, doubted=True))
+        assert attempts.nearness == 0.3 and attempts.seed == 0
+    assert not doubted(better, 24.1) and doubted(worse, 24.0, (4.0, 4.0))
+    worse.give_up(StuckError(24.0, doubted=True))
+    assert worse.nearness == 0 and worse.seed == 0 and not doubted(worse, 20.0)
+    for attempts, nearness in ((better, 0.3), (worse, 0.0)):  # may be foam all the same
+        assert attempts.patience.ends(500, 24.0, (0.1, 5.0)) and not attempts.patience.ends(500, 24.0, (1.0, 5.0))
+        for k, left_out in enumerate([21.0, 23.0, 22.0, 20.0], 1):
+            attempts.give_up(StuckError(left_out))
+            assert attempts.seed == (k if k < 4 else 1) and attempts.nearness == nearness
+            assert not doubted(attempts, 10.0)
+        assert attempts.patience == ENDLESS
+    asked = Attempts(0.2, True)
+    assert asked.nearness == 0.2 and not doubted(asked, 10.0) and asked.patience.ends(750, 24.0, (0.1, 5.0))
+    assert Attempts(None, False).patience == ENDLESS
+
+
+def test_a_doubted_fit_is_tried_with_light_ending_farther_away(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("refield.field.fit.ASKED", (1, 3))
+    monkeypatch.setattr("refield.field.fit.DOUBT_STEP", 3)
+    monkeypatch.setattr("refield.field.attempts.DOUBT_STEP", 3)
+    short = replace(TINY, steps=10, check_every=100, field=replace(TINY.field, levels=2, log2_table=8))
+    plain, weighed = (fit_field(capture, replace(short, nearness=nearness)) for nearness in (0.0, 0.3))
+    for told, chosen in (([20.0, 19.0, 20.0, 19.5], weighed), ([20.0, 19.0, 20.0, 18.5, 20.0], plain)):
+        heard = iter(told)
+        monkeypatch.setattr(HeldOut, "psnr", lambda judge, model, exposed=False, heard=heard: next(heard, 30.0))
+        found = fit_field(capture, short)
+        assert next(heard, None) is None
+        assert all(torch.equal(a, b) for a, b in zip(found.parameters(), chosen.parameters()))
+    assert any(not torch.equal(a, b) for a, b in zip(plain.parameters(), weighed.parameters()))
 
 
 def test_how_near_light_ends_counts_while_a_fit_forms(

@@ -14,8 +14,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from refield.field.attempts import Patience, StuckError
 from refield.field.encoding import geometric_levels
-from refield.field.fit import FitConfig, Fitting, _StuckError
+from refield.field.fit import FitConfig
 from refield.field.kernels import reference
 from refield.field.kernels.reference import Aim, Batch, Stepped
 from refield.field.photo_model import PhotoModel, PhotoModelConfig
@@ -557,17 +558,18 @@ def test_the_loop_gives_up_and_goes_on_as_on_a_cpu(tmp_path: Path, monkeypatch: 
     whole = Descent.step
     monkeypatch.setattr(Descent, "step", lambda d, loss: (rates.append(float(d.rate)), whole(d, loss))[1])
     asked: list[int] = []
-    monkeypatch.setattr(Fitting, "_stuck", lambda fit, within: asked.append(fit.steps_done) or within != 3)
-    loop(capture, config).run(may_give_up=True)
-    assert asked == [3, 6] and max(rates) == pytest.approx(config.rate)
-    assert nearness == pytest.approx([config.nearness * max(1 - k / 6 / 0.4, 0) for k in range(6)])
+    monkeypatch.setattr("refield.field.fit.ASKED", (1, 4))
+    monkeypatch.setattr(Patience, "ends", lambda patience, step, *_: bool(asked.append(step)))
+    loop(capture, config).run(Patience(stuck=True))
+    assert asked == [4] and max(rates) == pytest.approx(config.rate)
+    assert nearness == pytest.approx([0.3 * max(1 - k / 6 / 0.4, 0) for k in range(6)])
     rates.clear()
     loop(capture, config, goes_on=True).run()
-    assert asked == [3, 6] and config.rate / 40 < min(rates) and max(rates) < 1.001 * config.rate
+    assert asked == [4] and config.rate / 40 < min(rates) and max(rates) < 1.001 * config.rate
     assert sum(rates) < 4 * config.rate  # as in the second half of a fit that begins
-    monkeypatch.setattr(Fitting, "_stuck", lambda fit, within: fit.steps_done == 3)
-    with pytest.raises(_StuckError):
-        loop(capture, config).run(may_give_up=True)
+    monkeypatch.setattr(Patience, "ends", lambda patience, step, *_: step == 4)
+    with pytest.raises(StuckError):
+        loop(capture, config).run(Patience(stuck=True))
 
 
 def test_a_step_is_no_larger_than_the_photos_are_worth() -> None:

@@ -10,6 +10,7 @@ from typing import Generic, Literal, TypeVar
 import torch
 
 from refield.field import kernels
+from refield.field.attempts import ASKED, DOUBT_STEP, ENDLESS, LATE, Attempts, Patience, StuckError
 from refield.field.compiling import Compiling, compiling
 from refield.field.coverage import beside
 from refield.field.descent import NonFiniteError, TableAdam
@@ -51,11 +52,12 @@ class FitConfig:
     distortion: float = 1e-2
     """weight of the distortion loss; without it fog fills the grid. Of dim photos less, as their squared errors
     of colour are: times the square of `PixelBank.brightness`"""
-    nearness: float = 0.0
+    nearness: float | None = None
     """weight, times that of the distortion, of how near to the camera light ends; it falls to none over the first 0.4
     of a fit, and is none in a fit that begins from a field. Haze before what is plain gathers where 1/2 + nearness/4 of
-    the light has ended; where half of it has, plain walls and floors may end up before the cameras. Try 0.3 for a place
-    that is mostly plain and has many photos; of few photos all may sink away behind itself"""
+    the light has ended; where half of it has, plain walls and floors may end up before the cameras. With it, what few
+    photos show may sink away behind itself. By default none, or 0.3 where left-out photos say early on that they are
+    shown better so"""
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera"""  # §10.1
     directions: bool = True
@@ -93,26 +95,7 @@ class FitProgress:
     seconds_left: float
 
 
-class _StuckError(RuntimeError):
-    """What the fit has built before the cameras hides the scene, and nothing behind it learns any more."""
-
-    def __init__(self, left_out: float) -> None:
-        super().__init__()
-        self.left_out = left_out
-        """PSNR of photos that are left out, dB"""
-
-
-# Some fits of a scene with a repeating texture, seen from all around, end in foam before the cameras: a few in a
-# hundred, of some captures most. Another seed does not. Foam is photos learnt by heart: those that are left out gain
-# nothing by it. From the first of these steps to the next, left-out photos gained -0.5 to 0.04 of what those that
-# teach did (in dB) in four foamed fits of one world, 0.27 to 0.67 in six sound ones of three real scenes, 0.7 and more
-# in nine others.
-# Others fall later: left-out photos of one of 36 random worlds gained 0.15 to step 500 and 0.04 to step 750, and were
-# shown 8 dB worse in the end than by other seeds.
-_TRIES, _FIRST_STEP, _LATER_STEPS = 5, 100, (500, 750)
 _FIRST = 0.1  # of its time, in which only steps tell how far it is
-_LATE = 0.3  # of its time; so late a fit does not begin anew
-_BY_HEART = 0.1
 _FORMING = 0.4  # of its time, in which a fit decides how far away things are
 
 
@@ -186,27 +169,25 @@ def fit_capture(
     with compiling(triton=on_gpu) as clock:
         photos = Photos.of(capture, since, most_pixels(config))
         core = _core(capture, config) if start is None and config.look_around else None
-        left_out: list[float] = []  # of each fit that was given up
-        for attempt in range(_TRIES):
-            # the last one is the best of those before, to its end
-            seed = config.seed + (attempt if attempt < _TRIES - 1 else left_out.index(max(left_out)))
+        attempts = Attempts(config.nearness, may_give_up=start is None)
+        while True:
+            seed = config.seed + attempts.seed
             torch.manual_seed(seed)
             model = new_field(capture, config, seed, core) if start is None else opened(start)
+            tried = replace(config, nearness=attempts.nearness)
             try:
-                may_give_up = start is None and attempt < _TRIES - 1
                 if on_gpu:
                     from refield.field.gpu_fit import fit_on_gpu
 
-                    told, how = (on_progress, on_step), (may_give_up, goes_on)
-                    found = fit_on_gpu(model, capture, photos, config, told, clock, how)
+                    told, how = (on_progress, on_step), (attempts.patience, goes_on)
+                    found = fit_on_gpu(model, capture, photos, tried, told, clock, how)
                 else:
-                    run = _Fit(model, photos, config, on_progress, on_step, clock, goes_on=goes_on)
-                    run.run(may_give_up)
+                    run = _Fit(model, photos, tried, on_progress, on_step, clock, goes_on=goes_on)
+                    run.run(attempts.patience)
                     found = run.photos.told(capture, run.judge, model)
                 break
-            except _StuckError as error:
-                left_out.append(error.left_out)
-                continue
+            except StuckError as error:
+                attempts.give_up(error)
             except NonFiniteError as error:
                 error.field = model.eval().requires_grad_(False)
                 raise
@@ -273,24 +254,25 @@ class Fitting:
         self.on_progress, self.on_step = told
         self.clock = clock or Compiling()
         self.loss = math.nan
-        self.first: tuple[float, float] | None = None  # at the first step that `_stuck` asks
+        self.first: tuple[float, float] | None = None
+        """dB of the photos that are left out and of those that teach, when first asked"""
         self.rays_done, self.steps_done = 0, 0
         self.samples_per_ray = math.nan
         """of late"""
 
-    def steps(self, may_give_up: bool) -> None:
-        """Raises _StuckError early on if the fit leads nowhere and ``may_give_up``."""
+    def steps(self, patience: Patience) -> None:
+        """Raises StuckError early on if the fit ends its ``patience``."""
         raise NotImplementedError
 
     def settle(self) -> None:
         """The field as it is shown from now on."""
         raise NotImplementedError
 
-    def run(self, may_give_up: bool = False) -> None:
-        """Raises _StuckError early on if the fit leads nowhere and ``may_give_up``."""
+    def run(self, patience: Patience = ENDLESS) -> None:
+        """Raises StuckError early on if the fit ends its ``patience``."""
         self.model.train()
         try:
-            self.steps(may_give_up)
+            self.steps(patience)
         except NonFiniteError:
             self.settle()
             raise
@@ -306,7 +288,7 @@ class Fitting:
 
     def nearness(self, progress: float) -> float:
         """What it weighs how near light ends."""
-        return self.config.nearness * max(1 - progress / _FORMING, 0.0)
+        return (self.config.nearness or 0.0) * max(1 - progress / _FORMING, 0.0)
 
     def may_expose(self, step: int, progress: float) -> None:
         """Find out, when that is due, whether photos are exposed alike."""
@@ -314,23 +296,18 @@ class Fitting:
             self.photos.exposing = self.judge.tells_exposures(self.model)
             self.model.train()
 
-    def give_up_if_stuck(self, within: int = 1) -> None:
-        """Raises _StuckError: the fit leads nowhere, and there is time to begin anew."""
-        if self._stuck(within) and self.progress(0) < _LATE:
-            raise _StuckError(self.judge.psnr(self.model, self.photos.exposing))
-
-    def _stuck(self, within: int) -> bool:
-        """Whether, by one of the later steps, the photos that teach have been learnt by heart; known only if some are
-        left out. Asked in every step, or in one of ``within``."""
-        if not any(0 <= self.steps_done - step < within for step in (_FIRST_STEP, *_LATER_STEPS)):
-            return False
-        now = -10 * math.log10(max(self.loss, 1e-12)), self.judge.psnr(self.model, self.photos.exposing)
+    def give_up_if_stuck(self, patience: Patience, within: int = 1) -> None:
+        """Raises StuckError: ``patience`` is at its end, and there is time to begin anew. Asked in every step, or in
+        one of ``within``."""
+        step = next((s for s in ASKED if 0 <= self.steps_done - s < within), None)
+        if step is None or patience == ENDLESS or self.progress(0) >= LATE:
+            return
+        now = self.judge.psnr(self.model, self.photos.exposing), -10 * math.log10(max(self.loss, 1e-12))
         self.model.train()
         if self.first is None:
             self.first = now
-            return False
-        taught, left_out = (b - a for a, b in zip(self.first, now))
-        return taught > 0 and left_out < _BY_HEART * taught
+        elif patience.ends(step, now[0], (now[0] - self.first[0], now[1] - self.first[1])):
+            raise StuckError(now[0], doubted=step == DOUBT_STEP)
 
     def look(self) -> None:
         """Tell how the fit goes, where somebody listens."""
@@ -380,7 +357,7 @@ class _Fit(Fitting):
         self.occupancy.settle(self.pixels)
         self.model.sampler = self.model.sampler.for_pictures()
 
-    def steps(self, may_give_up: bool) -> None:
+    def steps(self, patience: Patience) -> None:
         for step in range(self.config.steps):
             progress = self.progress(step)
             if progress >= 1:
@@ -389,8 +366,7 @@ class _Fit(Fitting):
             self.steps_done = step + 1
             if self.on_step:
                 self.on_step(step + 1, self.model)
-            if may_give_up:
-                self.give_up_if_stuck()
+            self.give_up_if_stuck(patience)
             if (step + 1) % self.config.check_every == 0:
                 self.look()
 

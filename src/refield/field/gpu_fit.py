@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from refield.field.attempts import ENDLESS, Patience
 from refield.field.compiling import Compiling
 from refield.field.coverage import beside
 from refield.field.descent import FADE_EVERY, MOST_SKIPPED, NonFiniteError, fading
@@ -46,17 +47,17 @@ def fit_on_gpu(
     config: FitConfig,
     told: tuple[ProgressCallback | None, StepCallback | None] = (None, None),
     clock: Compiling | None = None,
-    how: tuple[bool, bool] = (False, False),
+    how: tuple[Patience, bool] = (ENDLESS, False),
 ) -> Capture:
     """Fit a field to photos on the current CUDA device; the model comes back to where it was. Returns the capture with
     what the fit found out about its photos.
 
     As many steps as on a CPU, each of up to 32 times the samples. ``told``: who hears of looks, and of every 16th step.
-    ``clock``: of the fit, which may have begun before this. ``how``: whether it may be given up; whether it goes on
+    ``clock``: of the fit, which may have begun before this. ``how``: what it may be given up for; whether it goes on
     where another ended.
 
     Raises:
-        _StuckError: of a fit that may be given up, it leads nowhere.
+        StuckError: it ends that patience.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row.
     """
     home, device = model.encoding.tables.device, torch.device("cuda", torch.cuda.current_device())
@@ -121,7 +122,7 @@ class _GpuFit(Fitting):
         self.occupancy.settle(self.pixels)
         self.model.sampler = self.model.sampler.for_pictures()
 
-    def steps(self, may_give_up: bool) -> None:
+    def steps(self, patience: Patience) -> None:
         """All rounds of steps, each followed by what a graph cannot hold."""
         due = self.config.check_every
         graph, step = self._captured(0)
@@ -137,8 +138,7 @@ class _GpuFit(Fitting):
                 error = NonFiniteError(f"the loss or its gradient was not finite for {MOST_SKIPPED} steps in a row")
                 error.steps = int(self.descent.count)
                 raise error
-            if may_give_up:
-                self.give_up_if_stuck(within=EVERY)
+            self.give_up_if_stuck(patience, within=EVERY)
             if step >= due:
                 due += self.config.check_every
                 self.look()
