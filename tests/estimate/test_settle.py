@@ -473,13 +473,38 @@ def test_pieces_are_those_of_the_hypothesis_that_they_are_asked_beside(estimated
     assert ("cut", 0, id(found.olds[0])) in exchanges
 
 
-def test_a_piece_is_told_only_for_as_much_as_a_pose_must_gain(estimated):
+def test_a_thing_more_is_told_only_for_as_much_as_a_pose_must_gain(estimated):
     ground, _, changed, found = estimated
-    search, (k,) = settle.Search(ground, changed), found.moved
-    new = replace(found, olds=(*found.olds, found.olds[k]), moved={1: found.moved[k]}, touched=(1,))
-    least = ground.believe.gains * pixels_of(ground, new, 1)
-    assert search._worth(found, new, ("cut", 1, 0)) == pytest.approx(least + 1) and least > 100
-    assert search._worth(found, new, ("slid", 1, 0)) == search._worth(found, found, ("parted", 1, 0)) == 1
+    search, (k,), gains = settle.Search(ground, changed), found.moved, ground.believe.gains
+    change = replace(found.moved[k], before=0.3)
+    more = replace(found, olds=(*found.olds, found.olds[k]), moved={**found.moved, 1: change})
+    least = gains * pixels_of(ground, more, 1)
+    assert search._worth(found, more) == pytest.approx(least + 1) and least > 100
+    alike = replace(more, moved={**found.moved, 1: replace(change, before=0.6)})
+    assert search._worth(found, alike) == pytest.approx(2 * least + 1)
+    left = replace(more, moved=found.moved, removed={1: 0.9})
+    assert search._worth(found, left) == pytest.approx(gains * pixels_of(ground, left, 1) + 1)
+    assert search._worth(found, left) < search._worth(found, more)
+    assert search._worth(more, found) == search._worth(more, left) == search._worth(found, found) == 1
+    instead = replace(more, moved={1: change})
+    assert search._worth(found, instead) == 1 < search._worth(found, instead, piece=True)
+    nothing = settle.Settled(views=found.views, olds=more.olds)
+    assert search._worth(nothing, more) == 1 < search._worth(nothing, left, piece=True) < 2 * least + 1
+    assert search._worth(nothing, replace(alike, moved={1: alike.moved[1]}), piece=True) == pytest.approx(least + 1)
+
+
+def test_what_was_settled_stays_unless_things_more_explain_enough(estimated, monkeypatch):
+    ground, _, changed, found = estimated
+    k = len(found.olds)
+    more = replace(found, olds=(*found.olds, *found.olds), removed={k: 0.9})
+    least = settle.Search(ground, changed)._worth(found, more)
+    for gained, told in ((least - 1, found), (least + 1, more)):
+        search = settle.Search(ground, changed)
+        monkeypatch.setattr(search.__class__, "_placed", lambda *_: more)
+        monkeypatch.setattr(search.__class__, "_exchanges", lambda *_: [])
+        costs = {id(found): 1000.0, id(more): 1000.0 - gained}
+        monkeypatch.setattr(search.__class__, "_judged", lambda _, one, costs=costs: (one, costs[id(one)]))
+        assert search.settle([], found).removed == told.removed
 
 
 @pytest.mark.parametrize("known", [False, True])

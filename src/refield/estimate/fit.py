@@ -342,8 +342,14 @@ def _asked(ground: Ground, old: Old, past: Sequence[Past]) -> float:
 
 def gains_enough(ground: Ground, change: PoseChange, gains: float | None = None) -> bool:
     """Whether the photos show that much more of an object than of what was there; ``gains`` as configured if None."""
+    return change.explained >= change.before + gains_asked(ground, change, gains)
+
+
+def gains_asked(ground: Ground, change: PoseChange, gains: float | None = None) -> float:
+    """By how much more of an object than of what was there the photos must show, a part of its pixels: twice as much
+    where its place looks as before."""
     gains = ground.believe.gains if gains is None else gains
-    return change.explained >= change.before + gains * (2 if change.before > ground.believe.alike else 1)
+    return gains * (2 if change.before > ground.believe.alike else 1)
 
 
 def detail_for(ground: Ground, old: Old, past: Sequence[Past], new_from_old: Tensor) -> Detail | None:

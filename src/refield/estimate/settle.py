@@ -28,6 +28,7 @@ from refield.estimate.fit import (
     all_apart,
     at_one_place,
     believed,
+    gains_asked,
     gains_enough,
     is_among,
     left_by,
@@ -53,6 +54,7 @@ _Tries = Callable[[Settled], Iterator[Settled]]
 _Which = tuple[str, int, int]
 _SAME = 0.25
 """of an object's radius; places that are nearer to each other are asked for its rotation once"""
+_PIECES = ("cut", "parted")
 _OTHERS = ("elsewhere", "again", "stayed")
 """what says of an object something else, not the same more exactly"""
 
@@ -89,7 +91,7 @@ class Search:
     def settle(self, olds: Sequence[Old], begun: Settled | None = None) -> Settled:
         """Find each old object's new place or that it left, and what else arrived.
 
-        ``begun``: what was settled before these objects were known; it stays unless they leave less unexplained.
+        ``begun``: what was settled before these objects were known; it stays unless they leave enough less unexplained.
         """
         best, least = self._judged(self._placed(olds, begun or Settled()))
         again = True
@@ -102,23 +104,36 @@ class Search:
                     continue
                 others = [self._judged(other) for other in tries(best)]
                 other, tried[this] = min(others, key=lambda o: o[1], default=(best, math.inf))
-                if tried[this] < least - self._worth(best, other, this):
+                if tried[this] < least - self._worth(best, other, this[0] in _PIECES):
                     again, best, least, tried = True, other, tried[this], {}
                 self.ground.tally.count(sum(that not in tried for that, _ in exchanges[k:]))
-        if begun is not None and self._judged(begun)[1] <= least:
+        if begun is not None and self._judged(begun)[1] < least + self._worth(begun, best):
             return begun
         return self._led(best, least, tried)
 
     def _judged(self, settled: Settled) -> tuple[Settled, float]:
         return self.costs.get((settled,), lambda: judged(self.ground, settled))
 
-    def _worth(self, best: Settled, other: Settled, this: _Which) -> float:
-        """How many pixels less an exchange must leave unexplained. A piece fits more easily than a thing: it must gain
-        the part of its pixels, where it was and where it is, that a pose must which is believed."""
-        if this[0] not in ("cut", "parted"):
+    def _worth(self, best: Settled, other: Settled, piece: bool = False) -> float:
+        """How many pixels less a hypothesis must leave unexplained than the best one: of each thing more that moved or
+        left by it, the part of its pixels, where it was and where it is, that a pose must gain which is believed; less
+        those of each that it tells of no longer. What little a field, its light or the pose of another thing is wrong
+        by is explained by a thing more, too.
+
+        Where nothing is told yet something changed all the same: then only a ``piece`` must gain as much, which fits
+        more easily than a thing, and no more where its place looks as before.
+        """
+        beside = bool(best.moved or best.removed or best.arrived)
+        if not beside and not piece:
             return 1.0
-        pieces = [k for k in other.moved if k >= len(best.olds)]
-        return self.ground.believe.gains * sum(pixels_of(self.ground, other, k) for k in pieces) + 1
+        believe, worth = self.ground.believe, 0.0
+        told, now = best.moved.keys() | best.removed.keys(), other.moved.keys() | other.removed.keys()
+        for k in now - told:
+            gains = gains_asked(self.ground, other.moved[k]) if beside and k in other.moved else believe.gains
+            worth += gains * pixels_of(self.ground, other, k)
+        if not piece:  # it is told beside, or in place of, a whole that fits as well
+            worth -= sum(believe.gains * pixels_of(self.ground, best, k) for k in told - now)
+        return 1 + max(worth, 0.0)
 
     def turned(self, told: Settled) -> Settled:
         """What was settled, with each object rotated about its place as the photos show more of it, where they show
