@@ -479,18 +479,18 @@ def test_a_thing_more_is_told_only_for_as_much_as_a_pose_must_gain(estimated):
     change = replace(found.moved[k], before=0.3)
     more = replace(found, olds=(*found.olds, found.olds[k]), moved={**found.moved, 1: change})
     least = gains * pixels_of(ground, more, 1)
-    assert search._worth(found, more) == pytest.approx(least + 1) and least > 100
+    assert search._worth(found, more) == pytest.approx(least) and least > 100
     alike = replace(more, moved={**found.moved, 1: replace(change, before=0.6)})
-    assert search._worth(found, alike) == pytest.approx(2 * least + 1)
+    assert search._worth(found, alike) == pytest.approx(2 * least)
     left = replace(more, moved=found.moved, removed={1: 0.9})
-    assert search._worth(found, left) == pytest.approx(gains * pixels_of(ground, left, 1) + 1)
+    assert search._worth(found, left) == pytest.approx(gains * pixels_of(ground, left, 1))
     assert search._worth(found, left) < search._worth(found, more)
-    assert search._worth(more, found) == search._worth(more, left) == search._worth(found, found) == 1
+    assert search._worth(more, found) == search._worth(more, left) == search._worth(found, found) == 0
     instead = replace(more, moved={1: change})
-    assert search._worth(found, instead) == 1 < search._worth(found, instead, piece=True)
+    assert search._worth(found, instead) == 0 < search._worth(found, instead, piece=True)
     nothing = settle.Settled(views=found.views, olds=more.olds)
-    assert search._worth(nothing, more) == 1 < search._worth(nothing, left, piece=True) < 2 * least + 1
-    assert search._worth(nothing, replace(alike, moved={1: alike.moved[1]}), piece=True) == pytest.approx(least + 1)
+    assert search._worth(nothing, more) == 0 < search._worth(nothing, left, piece=True) < 2 * least
+    assert search._worth(nothing, replace(alike, moved={1: alike.moved[1]}), piece=True) == pytest.approx(least)
 
 
 def test_what_was_settled_stays_unless_things_more_explain_enough(estimated, monkeypatch):
@@ -505,6 +505,26 @@ def test_what_was_settled_stays_unless_things_more_explain_enough(estimated, mon
         costs = {id(found): 1000.0, id(more): 1000.0 - gained}
         monkeypatch.setattr(search.__class__, "_judged", lambda _, one, costs=costs: (one, costs[id(one)]))
         assert search.settle([], found).removed == told.removed
+
+
+def test_of_an_exchange_the_answer_that_tells_no_more_may_win(estimated, monkeypatch):
+    """One that tells a thing more is a little cheaper, and not by as much as the thing must gain."""
+    ground, _, changed, found = estimated
+    k, better = len(found.olds), replace(found)
+    more = replace(found, olds=(*found.olds, *found.olds), removed={k: 0.9})
+    costs = {id(found): 1000.0, id(better): 980.0, id(more): 970.0}
+    for tries, told in (([more, better], better), ([more], found)):
+        search = settle.Search(ground, changed)
+        monkeypatch.setattr(search.__class__, "_placed", lambda *_: found)
+        monkeypatch.setattr(search.__class__, "_judged", lambda _, one: (one, costs[id(one)]))
+        exchanges = [(("slid", 0, 0), lambda _, tries=tries: iter(tries))]
+        monkeypatch.setattr(
+            search.__class__, "_exchanges", lambda _, best, some=exchanges: some if best is found else []
+        )
+        kept = []
+        monkeypatch.setattr(search.__class__, "_led", lambda _, best, *rest, kept=kept: kept.append(best))
+        search.settle([])
+        assert kept[0] is told
 
 
 @pytest.mark.parametrize("known", [False, True])

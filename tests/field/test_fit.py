@@ -17,7 +17,7 @@ from numba.core import event
 from PIL import Image
 
 from refield.field import kernels
-from refield.field.attempts import ENDLESS, Attempts, Patience, StuckError
+from refield.field.attempts import ASKED, ENDLESS, Attempts, Patience, StuckError
 from refield.field.compiling import compiling
 from refield.field.descent import MOST_SKIPPED, NonFiniteError
 from refield.field.encoding import Contraction
@@ -153,7 +153,8 @@ def test_a_fit_that_leads_nowhere_begins_anew(capture: Capture, monkeypatch: pyt
         last = fit_field(capture, short)  # of four that were given up the best is fitted to its end
     assert all(torch.equal(a, b) for a, b in zip(last.parameters(), other.parameters()))
     asked.clear()
-    monkeypatch.setattr("refield.field.fit.LATE", 0.0)
+    monkeypatch.setattr("refield.field.attempts.LATER_STEPS", (3, 5))
+    monkeypatch.setattr("refield.field.attempts.LATE", 0.0)
     fit_field(capture, short)
     assert asked == []  # too late to begin anew: it goes on with what it has
 
@@ -184,18 +185,17 @@ def test_photos_learnt_by_heart_are_begun_anew(capture: Capture, tmp_path: Path)
         return torch.nn.functional.interpolate(blocks, photo.shape[:2], mode="bilinear")[0].permute(1, 2, 0)
 
     few = replace(capture, frames=capture.frames[:20])
-    short = replace(TINY, steps=510, samples=1024, check_every=1000, field=replace(TINY.field, levels=4), nearness=0.0)
+    short = replace(TINY, steps=510, samples=1024, check_every=1000, field=replace(TINY.field, levels=4))
     assert attempts(rephotographed(few, tmp_path, unrelated), short) == 5
 
 
-def test_bad_photos_of_a_scene_are_not_taken_for_foam(capture: Capture, tmp_path: Path) -> None:
+def test_bad_photos_of_a_scene_are_fitted_once(capture: Capture, tmp_path: Path) -> None:
     """Grain that no field can explain: the error stays large, and hardly falls once the scene is learnt."""
 
     def grainy(photo: torch.Tensor, i: int) -> torch.Tensor:
         return photo + 0.2 * torch.randn(photo.shape, generator=torch.Generator().manual_seed(i))
 
-    config = replace(TINY, steps=510, check_every=1000, nearness=0.0)
-    assert attempts(rephotographed(capture, tmp_path, grainy), config) == 1
+    assert attempts(rephotographed(capture, tmp_path, grainy), replace(TINY, steps=510, check_every=1000)) == 1
 
 
 def test_same_seed_same_field(capture: Capture) -> None:
@@ -279,16 +279,16 @@ def test_what_is_learnt_by_heart_is_noticed_at_three_steps(
     looks: list[tuple[int, float, float]], verdicts: list[bool]
 ) -> None:
     """Steps done, PSNR of the photos that teach and of those left out; the first two are two seeds of one world."""
-    fit: Any = SimpleNamespace(first=None, model=SimpleNamespace(train=lambda: None), progress=lambda step: 0.0)
+    fit: Any = SimpleNamespace(first=None, model=SimpleNamespace(train=lambda: None), _once_worked=lambda times: 0.0)
     fit.photos, found = SimpleNamespace(exposing=False), []
     for step, taught, left_out in looks:
         fit.steps_done, fit.loss = step, 10 ** (-taught / 10)
         fit.judge = SimpleNamespace(psnr=lambda *_, seen=left_out: seen)
         try:
-            _Fit.give_up_if_stuck(fit, Attempts(None, True).patience)
+            _Fit.give_up_if_stuck(fit, Attempts(None, 2000, True).patience)
             found.append(False)
         except StuckError as error:
-            assert (error.left_out, error.doubted) == (left_out, step == 400)
+            assert (error.left_out, error.step) == (left_out, step)
             found.append(True)
     assert found == verdicts
 
@@ -297,33 +297,42 @@ def test_two_ways_to_weigh_how_near_light_ends_are_compared_by_photos_left_out()
     def doubted(attempts: Attempts, left_out: float, gained: tuple[float, float] = (1.0, 4.0)) -> bool:
         return attempts.patience.ends(400, left_out, gained)
 
-    better, worse = Attempts(None, True), Attempts(None, True)
+    better, worse = Attempts(None, 2000, True), Attempts(None, 2000, True)
     for attempts in (better, worse):
         assert attempts.nearness == 0 and doubted(attempts, 24.0) and not doubted(attempts, 24.0, (2.0, 4.0))
-        attempts.give_up(StuckError(24.0, doubted=True))
+        attempts.give_up(StuckError(24.0, 400))
         assert attempts.nearness == 0.3 and attempts.seed == 0
     assert not doubted(better, 24.1) and doubted(worse, 24.0, (4.0, 4.0))
-    worse.give_up(StuckError(24.0, doubted=True))
+    worse.give_up(StuckError(24.0, 400))
     assert worse.nearness == 0 and worse.seed == 0 and not doubted(worse, 20.0)
-    for attempts, nearness in ((better, 0.3), (worse, 0.0)):  # may be foam all the same
-        assert attempts.patience.ends(500, 24.0, (0.1, 5.0)) and not attempts.patience.ends(500, 24.0, (1.0, 5.0))
-        for k, left_out in enumerate([21.0, 23.0, 22.0, 20.0], 1):
-            attempts.give_up(StuckError(left_out))
-            assert attempts.seed == (k if k < 4 else 1) and attempts.nearness == nearness
-            assert not doubted(attempts, 10.0)
-        assert attempts.patience == ENDLESS
-    asked = Attempts(0.2, True)
-    assert asked.nearness == 0.2 and not doubted(asked, 10.0) and asked.patience.ends(750, 24.0, (0.1, 5.0))
-    assert Attempts(None, False).patience == ENDLESS
+    for attempts, nearness in ((better, 0.3), (worse, 0.0)):  # may be foam all the same; other seeds are asked anew
+        for k, left_out in enumerate([23.0, 21.0, 22.0, 20.0], 1):
+            assert attempts.patience.ends(500, 24.0, (0.1, 5.0)) and not attempts.patience.ends(500, 24.0, (1.0, 5.0))
+            attempts.give_up(StuckError(left_out, 500))
+            assert attempts.seed == (k if k < 4 else 0) and doubted(attempts, 10.0) == (k < 4)
+        assert attempts.patience == ENDLESS and attempts.nearness == nearness
+    for attempts in (Attempts(0.2, 2000, True), Attempts(None, 1000, True)):  # too few steps to begin anew so late
+        assert not doubted(attempts, 10.0) and attempts.patience.ends(750, 24.0, (0.1, 5.0))
+    assert Attempts(0.2, 2000, True).nearness == 0.2 and Attempts(None, 2000, False).patience == ENDLESS
+
+
+def test_a_second_opinion_is_asked_only_if_it_will_be_judged_in_time() -> None:
+    first = Attempts(None, 2000, True)
+    asked = [(step, first.patience.is_late(step, lambda times: 0.1 * times)) for step in ASKED]
+    assert asked == [(100, False), (400, False), (500, False), (750, False)]
+    asked = [(step, first.patience.is_late(step, lambda times: 0.16 * times)) for step in ASKED]
+    assert asked == [(100, False), (400, True), (500, False), (750, False)]
+    first.give_up(StuckError(24.0, 400))  # it is judged, whatever the time
+    asked = [(step, first.patience.is_late(step, lambda times: 0.5 * times)) for step in ASKED]
+    assert asked == [(100, False), (400, False), (500, True), (750, True)]
 
 
 def test_a_doubted_fit_is_tried_with_light_ending_farther_away(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("refield.field.fit.ASKED", (1, 3))
-    monkeypatch.setattr("refield.field.fit.DOUBT_STEP", 3)
     monkeypatch.setattr("refield.field.attempts.DOUBT_STEP", 3)
-    short = replace(TINY, steps=10, check_every=100, field=replace(TINY.field, levels=2, log2_table=8))
+    short = replace(TINY, steps=12, check_every=100, field=replace(TINY.field, levels=2, log2_table=8))
     plain, weighed = (fit_field(capture, replace(short, nearness=nearness)) for nearness in (0.0, 0.3))
     for told, chosen in (([20.0, 19.0, 20.0, 19.5], weighed), ([20.0, 19.0, 20.0, 18.5, 20.0], plain)):
         heard = iter(told)

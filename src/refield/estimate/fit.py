@@ -346,7 +346,7 @@ def gains_enough(ground: Ground, change: PoseChange, gains: float | None = None)
 
 
 def gains_asked(ground: Ground, change: PoseChange, gains: float | None = None) -> float:
-    """By how much more of an object than of what was there the photos must show, a part of its pixels: twice as much
+    """The part of an object's pixels by which the photos must show more of it than of what was there; twice as much
     where its place looks as before."""
     gains = ground.believe.gains if gains is None else gains
     return gains * (2 if change.before > ground.believe.alike else 1)

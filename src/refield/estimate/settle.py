@@ -103,11 +103,15 @@ class Search:
                 if this in tried:
                     continue
                 others = [self._judged(other) for other in tries(best)]
-                other, tried[this] = min(others, key=lambda o: o[1], default=(best, math.inf))
-                if tried[this] < least - self._worth(best, other, this[0] in _PIECES):
-                    again, best, least, tried = True, other, tried[this], {}
+                asked = [
+                    left + self._worth(best, o, this[0] in _PIECES) if left < least else left for o, left in others
+                ]
+                tried[this] = min(asked, default=math.inf)
+                if tried[this] < least - 1:
+                    best, least = others[asked.index(tried[this])]
+                    again, tried = True, {}
                 self.ground.tally.count(sum(that not in tried for that, _ in exchanges[k:]))
-        if begun is not None and self._judged(begun)[1] < least + self._worth(begun, best):
+        if begun is not None and self._judged(begun)[1] <= least + self._worth(begun, best):
             return begun
         return self._led(best, least, tried)
 
@@ -115,7 +119,7 @@ class Search:
         return self.costs.get((settled,), lambda: judged(self.ground, settled))
 
     def _worth(self, best: Settled, other: Settled, piece: bool = False) -> float:
-        """How many pixels less a hypothesis must leave unexplained than the best one: of each thing more that moved or
+        """How many pixels less than the best one a hypothesis must leave unexplained: of each thing more that moved or
         left by it, the part of its pixels, where it was and where it is, that a pose must gain which is believed; less
         those of each that it tells of no longer. What little a field, its light or the pose of another thing is wrong
         by is explained by a thing more, too.
@@ -125,15 +129,19 @@ class Search:
         """
         beside = bool(best.moved or best.removed or best.arrived)
         if not beside and not piece:
-            return 1.0
-        believe, worth = self.ground.believe, 0.0
+            return 0.0
         told, now = best.moved.keys() | best.removed.keys(), other.moved.keys() | other.removed.keys()
-        for k in now - told:
-            gains = gains_asked(self.ground, other.moved[k]) if beside and k in other.moved else believe.gains
-            worth += gains * pixels_of(self.ground, other, k)
+        worth = sum(self._gain(other, k, beside) for k in now - told)
         if not piece:  # it is told beside, or in place of, a whole that fits as well
-            worth -= sum(believe.gains * pixels_of(self.ground, best, k) for k in told - now)
-        return 1 + max(worth, 0.0)
+            worth -= sum(self._gain(best, k, beside) for k in told - now)
+        return max(worth, 0.0)
+
+    def _gain(self, settled: Settled, k: int, beside: bool) -> float:
+        """Pixels, where an object was and where it is, that it must gain to be told, ``beside`` other things or not."""
+        gains = self.ground.believe.gains
+        if beside and k in settled.moved:
+            gains = gains_asked(self.ground, settled.moved[k])
+        return gains * pixels_of(self.ground, settled, k)
 
     def turned(self, told: Settled) -> Settled:
         """What was settled, with each object rotated about its place as the photos show more of it, where they show

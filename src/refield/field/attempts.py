@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 # Some fits of a scene with a repeating texture, seen from all around, end in foam before the cameras: a few in a
@@ -29,10 +30,10 @@ _NEARNESS = 0.3
 class StuckError(RuntimeError):
     """What the fit has built before the cameras hides the scene, or may hide it, and something else is tried."""
 
-    def __init__(self, left_out: float, doubted: bool = False) -> None:
+    def __init__(self, left_out: float, step: int) -> None:
         super().__init__()
-        self.left_out, self.doubted = left_out, doubted
-        """PSNR of photos that are left out, dB; whether it was given up at `DOUBT_STEP`"""
+        self.left_out, self.step = left_out, step
+        """PSNR of photos that are left out, dB, at the step of `ASKED` at which it was given up"""
 
 
 @dataclass(frozen=True)
@@ -46,12 +47,20 @@ class Patience:
     rival: float = -math.inf
     """at `DOUBT_STEP`: it shows them no better than another fit did, dB"""
 
+    def is_late(self, step: int, progress: Callable[[float], float]) -> bool:
+        """Whether it is too late to begin anew at a step; ``progress``: of the fit's time, once it took so many times
+        as long as now."""
+        if step in LATER_STEPS:
+            return progress(1) >= LATE
+        # the second fit is judged whatever the time: it may be the worse one; so it begins only if that is in time
+        return step == DOUBT_STEP and self.doubt and progress(2) >= LATE
+
     def ends(self, step: int, left_out: float, gained: tuple[float, float]) -> bool:
         """Whether a fit ends at a step at which it was asked; ``left_out``: how it shows the photos that are left out,
         dB, NaN if there are none; ``gained``: what they and those that teach gained since `FIRST_STEP`, dB."""
         useful, taught = gained
         if step == DOUBT_STEP:
-            return left_out <= self.rival or (self.doubt and useful < _DOUBTFUL * taught)
+            return left_out <= self.rival or (self.doubt and taught > 0 and useful < _DOUBTFUL * taught)
         return self.stuck and taught > 0 and useful < _BY_HEART * taught
 
 
@@ -61,22 +70,25 @@ ENDLESS = Patience()
 class Attempts:
     """What the next fit of the same photos begins with."""
 
-    def __init__(self, nearness: float | None, may_give_up: bool) -> None:
-        """``nearness``: as `FitConfig` has it; None: it is found out, if fits may be given up."""
-        self.nearness = nearness or 0.0
-        self.seed = 0
-        """after the first fit's"""
-        self.patience = Patience(may_give_up, doubt=nearness is None and may_give_up)
-        self._left_out: list[float] = []  # of each seed that was given up
+    def __init__(self, nearness: float | None, steps: int, may_give_up: bool) -> None:
+        """``nearness``: as `FitConfig` has it; None: it is found out, if fits of so many ``steps`` may be given up and
+        are long enough for a second opinion."""
+        self.seed, self.nearness = 0, nearness or 0.0
+        """the first is added to the config's"""
+        self.patience = Patience(may_give_up, doubt=nearness is None and may_give_up and LATE * steps > DOUBT_STEP)
+        self._begun = self.nearness, self.patience
+        self._ended: list[tuple[float, int, float]] = []  # left-out PSNR, seed and nearness of each that was stuck
 
     def give_up(self, error: StuckError) -> None:
         """The last one ended so."""
-        if error.doubted:  # in the second fit, of the first: there is no third opinion
+        if error.step == DOUBT_STEP:  # in the second fit, of the first: there is no third opinion
             first = self.patience.doubt
             self.nearness = _NEARNESS if first else 0.0
             self.patience = Patience(True, rival=error.left_out if first else -math.inf)
             return
-        self._left_out.append(error.left_out)
-        last = len(self._left_out) == _TRIES - 1  # the best of those before, to its end
-        self.seed = self._left_out.index(max(self._left_out)) if last else len(self._left_out)
-        self.patience = Patience(not last)
+        self._ended.append((error.left_out, self.seed, self.nearness))
+        if len(self._ended) < _TRIES - 1:
+            self.seed, (self.nearness, self.patience) = len(self._ended), self._begun
+        else:  # the best of those before, to its end
+            _, self.seed, self.nearness = max(self._ended, key=lambda one: one[0])
+            self.patience = ENDLESS

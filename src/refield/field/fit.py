@@ -10,7 +10,7 @@ from typing import Generic, Literal, TypeVar
 import torch
 
 from refield.field import kernels
-from refield.field.attempts import ASKED, DOUBT_STEP, ENDLESS, LATE, Attempts, Patience, StuckError
+from refield.field.attempts import ASKED, ENDLESS, Attempts, Patience, StuckError
 from refield.field.compiling import Compiling, compiling
 from refield.field.coverage import beside
 from refield.field.descent import NonFiniteError, TableAdam
@@ -161,30 +161,30 @@ def fit_capture(
     check_capture(capture)
     expect("the config of a fit", config, FitConfig, "a refield.field.fit.FitConfig")
     capture, since = as_read(capture, since, config.size)
-    if start is not None:  # it knows how far away things are
-        config = replace(config, nearness=0.0)
     on_gpu = config.device == "cuda"
     if on_gpu:
         _check_gpu(config, since)
     with compiling(triton=on_gpu) as clock:
         photos = Photos.of(capture, since, most_pixels(config))
         core = _core(capture, config) if start is None and config.look_around else None
-        attempts = Attempts(config.nearness, may_give_up=start is None)
+        # a field that is begun from knows how far away things are
+        attempts = Attempts(config.nearness if start is None else 0.0, config.steps, may_give_up=start is None)
         while True:
             seed = config.seed + attempts.seed
             torch.manual_seed(seed)
             model = new_field(capture, config, seed, core) if start is None else opened(start)
-            tried = replace(config, nearness=attempts.nearness)
+            tried, told, how = (
+                replace(config, nearness=attempts.nearness),
+                (on_progress, on_step),
+                (attempts.patience, goes_on),
+            )
             try:
                 if on_gpu:
                     from refield.field.gpu_fit import fit_on_gpu
 
-                    told, how = (on_progress, on_step), (attempts.patience, goes_on)
                     found = fit_on_gpu(model, capture, photos, tried, told, clock, how)
                 else:
-                    run = _Fit(model, photos, tried, on_progress, on_step, clock, goes_on=goes_on)
-                    run.run(attempts.patience)
-                    found = run.photos.told(capture, run.judge, model)
+                    found = _fit_on_cpu(model, capture, photos, tried, told, clock, how)
                 break
             except StuckError as error:
                 attempts.give_up(error)
@@ -192,6 +192,21 @@ def fit_capture(
                 error.field = model.eval().requires_grad_(False)
                 raise
     return Fitted(model.eval().requires_grad_(False), at_full_size(found))
+
+
+def _fit_on_cpu(
+    model: HashField,
+    capture: Capture,
+    photos: Photos,
+    config: FitConfig,
+    told: tuple[ProgressCallback | None, StepCallback | None],
+    clock: Compiling,
+    how: tuple[Patience, bool],
+) -> Capture:
+    """As `gpu_fit.fit_on_gpu`."""
+    run = _Fit(model, photos, config, *told, clock, goes_on=how[1])
+    run.run(how[0])
+    return run.photos.told(capture, run.judge, model)
 
 
 # Enough to tell how far away things are: twice as many steps tell the same or up to a third more
@@ -255,13 +270,13 @@ class Fitting:
         self.clock = clock or Compiling()
         self.loss = math.nan
         self.first: tuple[float, float] | None = None
-        """dB of the photos that are left out and of those that teach, when first asked"""
+        """dB of the photos that are left out, and of the loss on those that teach, when first asked"""
         self.rays_done, self.steps_done = 0, 0
         self.samples_per_ray = math.nan
         """of late"""
 
     def steps(self, patience: Patience) -> None:
-        """Raises StuckError early on if the fit ends its ``patience``."""
+        """Raises StuckError early on if its ``patience`` runs out."""
         raise NotImplementedError
 
     def settle(self) -> None:
@@ -269,7 +284,7 @@ class Fitting:
         raise NotImplementedError
 
     def run(self, patience: Patience = ENDLESS) -> None:
-        """Raises StuckError early on if the fit ends its ``patience``."""
+        """Raises StuckError early on if its ``patience`` runs out."""
         self.model.train()
         try:
             self.steps(patience)
@@ -297,17 +312,21 @@ class Fitting:
             self.model.train()
 
     def give_up_if_stuck(self, patience: Patience, within: int = 1) -> None:
-        """Raises StuckError: ``patience`` is at its end, and there is time to begin anew. Asked in every step, or in
+        """Raises StuckError: its ``patience`` ran out, and there is time to begin anew. Asked in every step, or in
         one of ``within``."""
         step = next((s for s in ASKED if 0 <= self.steps_done - s < within), None)
-        if step is None or patience == ENDLESS or self.progress(0) >= LATE:
+        if step is None or patience == ENDLESS or patience.is_late(step, self._once_worked):
             return
         now = self.judge.psnr(self.model, self.photos.exposing), -10 * math.log10(max(self.loss, 1e-12))
         self.model.train()
         if self.first is None:
             self.first = now
         elif patience.ends(step, now[0], (now[0] - self.first[0], now[1] - self.first[1])):
-            raise StuckError(now[0], doubted=step == DOUBT_STEP)
+            raise StuckError(now[0], step)
+
+    def _once_worked(self, times: float) -> float:
+        """How far the fit is by its time alone, once it worked so many times as long as now."""
+        return progress_of(self.config, 0, times * self.clock.worked)
 
     def look(self) -> None:
         """Tell how the fit goes, where somebody listens."""

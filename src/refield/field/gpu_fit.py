@@ -57,7 +57,7 @@ def fit_on_gpu(
     where another ended.
 
     Raises:
-        StuckError: it ends that patience.
+        StuckError: that patience ran out.
         NonFiniteError: the loss or its gradient was not finite for 20 steps in a row.
     """
     home, device = model.encoding.tables.device, torch.device("cuda", torch.cuda.current_device())
