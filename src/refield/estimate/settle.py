@@ -55,6 +55,7 @@ _Which = tuple[str, int, int]
 _SAME = 0.25
 """of an object's radius; places that are nearer to each other are asked for its rotation once"""
 _PIECES = ("cut", "parted")
+"""exchanges that tell pieces of an outline for things"""
 _OTHERS = ("elsewhere", "again", "stayed")
 """what says of an object something else, not the same more exactly"""
 

@@ -57,7 +57,7 @@ class FitConfig:
     of a fit, and is none in a fit that begins from a field. Haze before what is plain gathers where 1/2 + nearness/4 of
     the light has ended; where half of it has, plain walls and floors may end up before the cameras. With it, what few
     photos show may sink away behind itself. By default none, or 0.3 where left-out photos say early on that they are
-    shown better so"""
+    shown better so; 0: never"""
     gradient_unit: float = 1.0
     """gradient scaling reaches 1 at this many core radii from the camera"""  # §10.1
     directions: bool = True
@@ -162,8 +162,12 @@ def fit_capture(
     expect("the config of a fit", config, FitConfig, "a refield.field.fit.FitConfig")
     capture, since = as_read(capture, since, config.size)
     on_gpu = config.device == "cuda"
+    fit = _fit_on_cpu
     if on_gpu:
         _check_gpu(config, since)
+        from refield.field.gpu_fit import fit_on_gpu
+
+        fit = fit_on_gpu
     with compiling(triton=on_gpu) as clock:
         photos = Photos.of(capture, since, most_pixels(config))
         core = _core(capture, config) if start is None and config.look_around else None
@@ -173,18 +177,9 @@ def fit_capture(
             seed = config.seed + attempts.seed
             torch.manual_seed(seed)
             model = new_field(capture, config, seed, core) if start is None else opened(start)
-            tried, told, how = (
-                replace(config, nearness=attempts.nearness),
-                (on_progress, on_step),
-                (attempts.patience, goes_on),
-            )
+            tried, told = replace(config, nearness=attempts.nearness), (on_progress, on_step)
             try:
-                if on_gpu:
-                    from refield.field.gpu_fit import fit_on_gpu
-
-                    found = fit_on_gpu(model, capture, photos, tried, told, clock, how)
-                else:
-                    found = _fit_on_cpu(model, capture, photos, tried, told, clock, how)
+                found = fit(model, capture, photos, tried, told, clock, (attempts.patience, goes_on))
                 break
             except StuckError as error:
                 attempts.give_up(error)
