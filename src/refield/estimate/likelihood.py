@@ -46,6 +46,8 @@ class Settled:
     led: dict[int, float] = field(default_factory=dict)
     """by index of the old object: pixels that the best other answer for it does not explain and this one does, as a
     part of those that show it or show where it was"""
+    left: tuple[Array, ...] = ()
+    """(H, W) of each photo, what is left unexplained of its pixels"""
     twins: dict[int, tuple[PoseChange, ...]] = field(default_factory=dict)
     """by index of the old object that moved: other poses at its place that explain as much"""
 
@@ -76,7 +78,7 @@ def judged(ground: Ground, settled: Settled) -> tuple[Settled, float]:
     for k in (*settled.moved, *settled.removed):
         cost += price((silhouette(p.view, settled.olds[k]) for p in settled.views), smallest)
     cost += sum(price(shown, smallest, moved=True) for shown in zip(*(placed for _, _, placed in found)))
-    told = replace(settled, arrived=tuple(arrived), came=tuple(came))
+    told = replace(settled, arrived=tuple(arrived), came=tuple(came), left=tuple(left))
     return told, cost + sum(float(e.sum()) for e in left)
 
 
@@ -139,6 +141,17 @@ def pixels_of(ground: Ground, settled: Settled, k: int) -> int:
     """How many pixels of the new photos show an object, or show where it was."""
     there = sum(int(silhouette(p.view, settled.olds[k]).sum()) for p in settled.views)
     return there + (pixels_at(ground, settled, k) if k in settled.moved else 0)
+
+
+def gained_by(ground: Ground, best: Settled, other: Settled, k: int) -> float:
+    """How much less the other hypothesis leaves unexplained than the best one where an object of it is or was."""
+    gained = 0.0
+    for p, was, now in zip(other.views, best.left, other.left):
+        where = silhouette(p.view, other.olds[k])
+        if k in other.moved:
+            where = where | _before(ground, other.olds[k], other.moved[k], p, p.rgb, p.beyond)[2]
+        gained += float((was - now)[where].sum())
+    return gained
 
 
 def pixels_at(ground: Ground, settled: Settled, k: int) -> int:

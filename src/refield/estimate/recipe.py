@@ -161,7 +161,7 @@ def estimate_change(
     more = _overlooked(scene, ground, settled, parts.others, told) if parts.things else []
     if more:
         settled = search.settle([o for o in more if not is_piece(o, [*told, *more])], settled)
-    settled = search.turned(settled)
+    settled = search.likely(search.turned(settled))
     say("segment")
     answer = concluded(Told(ground, capture.train, scene.changed, photos, scene.errors), settled)
     return replace(answer, why=answer.why + _never_seen(scene.changed))

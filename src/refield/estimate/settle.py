@@ -19,6 +19,7 @@ import torch
 from refield.estimate.arrive import exactly, fresh, newcomers, remarkable
 from refield.estimate.associate import may_have_changed, place_all, places_of, without
 from refield.estimate.comoving import with_comoving
+from refield.estimate.confidence import confidence
 from refield.estimate.consist import consistent
 from refield.estimate.cost import CAME
 from refield.estimate.detect import Changed
@@ -40,7 +41,7 @@ from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
 from refield.estimate.lattice import Body
 from refield.estimate.layers import Sight
-from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of, unexplained_at
+from refield.estimate.likelihood import Settled, gained_by, judged, pixels_at, pixels_of, unexplained_at
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import as_one, standing
@@ -58,6 +59,10 @@ _PIECES = ("cut", "parted")
 """exchanges that tell pieces of an outline for things"""
 _OTHERS = ("elsewhere", "again", "stayed")
 """what says of an object something else, not the same more exactly"""
+
+
+_EVEN = 0.5
+"""confidence in what is as likely as not"""
 
 
 @dataclass(frozen=True)
@@ -132,7 +137,10 @@ class Search:
         if not beside and not piece:
             return 0.0
         told, now = best.moved.keys() | best.removed.keys(), other.moved.keys() | other.removed.keys()
-        worth = sum(self._gain(other, k, beside) for k in now - told)
+        gains = {k: self._gain(other, k, beside) for k in now - told}
+        if any(gained_by(self.ground, best, other, k) < gain for k, gain in gains.items()):
+            return math.inf
+        worth = sum(gains.values())
         if not piece:  # it is told beside, or in place of, a whole that fits as well
             worth -= sum(self._gain(best, k, beside) for k in told - now)
         return max(worth, 0.0)
@@ -143,6 +151,21 @@ class Search:
         if beside and k in settled.moved:
             gains = gains_asked(self.ground, settled.moved[k])
         return gains * pixels_of(self.ground, settled, k)
+
+    def likely(self, told: Settled) -> Settled:
+        """What was settled, without what left or arrived beside other things and is less likely so than not; unless
+        both did, which may be one thing that moved."""
+        if told.removed and told.arrived:
+            return told
+        for k in sorted(told.removed, key=lambda k: told.led[k]):
+            if len(told.gone) > 1 and confidence("removed", told.led[k], half=False) < _EVEN:
+                fewer, _ = self._judged(self._less(told, k, self.first.get(k, told.olds[k]), []))
+                told = replace(fewer, led=told.led, twins=told.twins)
+        came = list(zip(told.arrived, told.came))
+        sure = [(body, lead) for body, lead in came if confidence("added", lead, half=False) >= _EVEN]
+        if len(sure) < len(came) and (sure or told.moved):
+            told = replace(told, arrived=tuple(body for body, _ in sure), came=tuple(lead for _, lead in sure))
+        return told
 
     def turned(self, told: Settled) -> Settled:
         """What was settled, with each object rotated about its place as the photos show more of it, where they show
