@@ -144,17 +144,23 @@ def pixels_of(ground: Ground, settled: Settled, k: int) -> int:
 
 
 def gained_by(ground: Ground, best: Settled, other: Settled, k: int) -> float:
-    """How much less the other hypothesis leaves unexplained than the best one where an object of it is or was."""
-    gained = 0.0
-    for p, was, now in zip(other.views, best.left, other.left):
-        where = silhouette(p.view, other.olds[k])
-        if k in other.moved:
-            where = where | _before(ground, other.olds[k], other.moved[k], p, p.rgb, p.beyond)[2]
-        gained += float((was - now)[where].sum())
-    return gained
+    """How much less another hypothesis leaves unexplained than the best one where an object of it is or was."""
+    less = [was - now for was, now in zip(best.left, other.left)]
+    return sum(float(part[where].sum()) for part, where in zip(less, _where(ground, other, k)))
+
+
+def _where(ground: Ground, settled: Settled, k: int) -> list[Mask]:
+    """Per photo, the pixels (H, W) that show an object, or show where it was."""
+    was = [silhouette(p.view, settled.olds[k]) for p in settled.views]
+    return [a | b for a, b in zip(was, _at(ground, settled, k))] if k in settled.moved else was
 
 
 def pixels_at(ground: Ground, settled: Settled, k: int) -> int:
     """How many pixels of the new photos show an object that moved."""
+    return sum(int(shown.sum()) for shown in _at(ground, settled, k))
+
+
+def _at(ground: Ground, settled: Settled, k: int) -> list[Mask]:
+    """Per photo, the pixels (H, W) that show an object that moved."""
     old, change = settled.olds[k], settled.moved[k]
-    return sum(int(_before(ground, old, change, p, p.rgb, p.beyond)[2].sum()) for p in settled.views)
+    return [_before(ground, old, change, p, p.rgb, p.beyond)[2] for p in settled.views]
