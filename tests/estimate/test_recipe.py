@@ -1,5 +1,7 @@
 """What changed, end to end, on worlds that are known in closed form."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -147,6 +149,21 @@ def test_another_scene_is_refused(old, tmp_path):
     wall = standing((0.95, 0.95, 0.5), 0, 0, 0, paint=-1)
     with pytest.raises(InputError, match="% of the pixels changed; is this the same scene"):
         estimate(old, BoxWorld((wall,)), tmp_path)
+
+
+def test_a_scene_of_which_much_changed_is_told_from_another(old, tmp_path):
+    """By the pixels that are as the field shows them from there; where an old camera was near, it may be none."""
+    true = turn(centre(CRATE), 50, (0.35, -0.15, 0))
+    little = EstimateConfig(survey=6, most_changed=0.005)  # of a photo's pixels
+    photos = new_photos(BoxWorld((CRATE.moved(true), DRUM)), tmp_path / "moved")
+    change = estimate_change(old, BEFORE, photos, little)
+    assert [o.kind for o in change.objects] == ["moved"] and all(p.status == "used" for p in change.photos)
+    path, shape = tmp_path / "noise.png", (photos[0].camera.height, photos[0].camera.width, 3)
+    write_image(path, torch.rand(shape, generator=torch.Generator().manual_seed(0)))
+    noise = replace(photos[0], path=path, name="noise.png")
+    swapped = replace(photos[1], world_from_cam=photos[2].world_from_cam, name="swapped.png")
+    change = estimate_change(old, BEFORE, [noise, swapped, *photos], little)
+    assert [p.status for p in change.photos] == ["rejected", "rejected", "used", "used", "used", "used"]
 
 
 def test_a_field_that_does_not_show_its_own_photos_is_refused(old, tmp_path):

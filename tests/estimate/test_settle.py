@@ -12,7 +12,7 @@ from refield.estimate import arrive, fit, recipe, rotations, settle
 from refield.estimate.faces import Part
 from refield.estimate.lattice import Body, Lattice, grown, some_of
 from refield.estimate.layers import Sight
-from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of
+from refield.estimate.likelihood import Settled, judged, pixels_at, pixels_of, shown_or_was
 from refield.estimate.models import Models
 from refield.estimate.outline import as_one, restricted
 from refield.estimate.tally import Tally
@@ -473,30 +473,73 @@ def test_pieces_are_those_of_the_hypothesis_that_they_are_asked_beside(estimated
     assert ("cut", 0, id(found.olds[0])) in exchanges
 
 
+def with_left(settled: Settled, much: float) -> Settled:
+    """The hypothesis as if it left so much of each pixel unexplained."""
+    return replace(settled, left=tuple(np.full_like(left, much) for left in settled.left))
+
+
 def test_a_thing_more_is_told_only_for_as_much_as_a_pose_must_gain(estimated):
-    ground, _, changed, found = estimated
-    search, (k,), gains = settle.Search(ground, changed), found.moved, ground.believe.gains
+    ground, _, changed, told = estimated
+    search, (k,), gains = settle.Search(ground, changed), told.moved, ground.believe.gains
+    wrong, found = with_left(told, 1), with_left(told, 0)
     change = replace(found.moved[k], before=0.3)
     more = replace(found, olds=(*found.olds, found.olds[k]), moved={**found.moved, 1: change})
     least = gains * pixels_of(ground, more, 1)
-    assert search._worth(found, more) == pytest.approx(least) and least > 100
+    assert search._worth(wrong, more) == pytest.approx(least) and least > 100
     alike = replace(more, moved={**found.moved, 1: replace(change, before=0.6)})
-    assert search._worth(found, alike) == pytest.approx(2 * least)
+    assert search._worth(wrong, alike) == pytest.approx(2 * least)
     left = replace(more, moved=found.moved, removed={1: 0.9})
-    assert search._worth(found, left) == pytest.approx(gains * pixels_of(ground, left, 1))
-    assert search._worth(found, left) < search._worth(found, more)
-    assert search._worth(more, found) == search._worth(more, left) == search._worth(found, found) == 0
+    assert search._worth(wrong, left) == pytest.approx(gains * pixels_of(ground, left, 1))
+    assert search._worth(wrong, left) < search._worth(wrong, more)
+    more_wrong = with_left(more, 1)
+    assert search._worth(more_wrong, found) == search._worth(more_wrong, left) == search._worth(wrong, found) == 0
     instead = replace(more, moved={1: change})
-    assert search._worth(found, instead) == 0 < search._worth(found, instead, piece=True)
-    nothing = settle.Settled(views=found.views, olds=more.olds)
+    assert search._worth(wrong, instead) == 0 < search._worth(wrong, instead, piece=True)
+    nothing = settle.Settled(views=wrong.views, olds=more.olds, left=wrong.left)
     assert search._worth(nothing, more) == 0 < search._worth(nothing, left, piece=True) < 2 * least
     assert search._worth(nothing, replace(alike, moved={1: alike.moved[1]}), piece=True) == pytest.approx(least)
 
 
+def test_what_a_thing_gains_must_be_gained_where_it_is_or_was(estimated):
+    """That what arrived is outlined better beside it says nothing of it."""
+    ground, _, changed, told = estimated
+    search, (k,) = settle.Search(ground, changed), told.moved
+    wrong = with_left(told, 1)
+    change = replace(told.moved[k], before=0.3)
+    more = replace(wrong, olds=(*told.olds, told.olds[k]), moved={**told.moved, 1: change})
+    here = shown_or_was(ground, more, 1)
+    assert search._worth(wrong, replace(more, left=tuple(np.where(h, 1, 0) for h in here))) == math.inf
+    assert math.isfinite(search._worth(wrong, replace(more, left=tuple(np.where(h, 0, 1) for h in here))))
+    least, pixels = search._gain(more, 1, beside=True), sum(int(h.sum()) for h in here)
+    for part, enough in ((1.1, True), (0.9, False)):
+        some = replace(more, left=tuple(np.where(h, 1 - part * least / pixels, 1) for h in here))
+        assert math.isfinite(search._worth(wrong, some)) is enough
+
+
+def test_what_left_or_arrived_beside_others_is_told_only_if_it_is_likelier_than_not(estimated):
+    ground, olds, changed, found = estimated
+    (k,) = found.moved
+    _, body = came_to(ground, olds, changed)
+    search = settle.Search(ground, changed)
+    other = len(found.olds)
+    two = replace(found, olds=(*found.olds, found.olds[k]), touched=(*found.touched, other), removed={other: 0.9})
+    for led, told in ((0.4, []), (0.6, [other])):
+        likely = search.likely(replace(two, led={k: 0.5, other: led}))
+        assert list(likely.removed) == told and list(likely.moved) == [k] and likely.led[k] == 0.5
+    alone = replace(two, moved={}, led={other: 0.1})
+    assert search.likely(alone) is alone
+    for came, told in ((0.8, 0), (0.9, 1)):
+        assert len(search.likely(replace(found, arrived=(body,), came=(came,))).arrived) == told
+        assert len(search.likely(replace(found, moved={}, arrived=(body,), came=(came,))).arrived) == 1
+        # one of two halves of a move may be as unlikely as it is
+        both = replace(two, led={k: 0.5, other: 0.1}, arrived=(body,), came=(came,))
+        assert search.likely(both) is both
+
+
 def test_what_was_settled_stays_unless_things_more_explain_enough(estimated, monkeypatch):
-    ground, _, changed, found = estimated
-    k = len(found.olds)
-    more = replace(found, olds=(*found.olds, *found.olds), removed={k: 0.9})
+    ground, _, changed, told = estimated
+    k, found = len(told.olds), with_left(told, 1)
+    more = replace(with_left(told, 0), olds=(*found.olds, *found.olds), removed={k: 0.9})
     least = settle.Search(ground, changed)._worth(found, more)
     for gained, told in ((least - 1, found), (least + 1, more)):
         search = settle.Search(ground, changed)
@@ -509,11 +552,12 @@ def test_what_was_settled_stays_unless_things_more_explain_enough(estimated, mon
 
 def test_of_an_exchange_the_answer_that_tells_no_more_may_win(estimated, monkeypatch):
     """One that tells a thing more is a little cheaper, and not by as much as the thing must gain."""
-    ground, _, changed, found = estimated
-    k, better = len(found.olds), replace(found)
-    more = replace(found, olds=(*found.olds, *found.olds), removed={k: 0.9})
+    ground, _, changed, told = estimated
+    k, found = len(told.olds), with_left(told, 1)
+    better = with_left(told, 0)
+    more = replace(better, olds=(*found.olds, *found.olds), removed={k: 0.9})
     costs = {id(found): 1000.0, id(better): 980.0, id(more): 970.0}
-    for tries, told in (([more, better], better), ([more], found)):
+    for tries, best in (([more, better], better), ([more], found)):
         search = settle.Search(ground, changed)
         monkeypatch.setattr(search.__class__, "_placed", lambda *_: found)
         monkeypatch.setattr(search.__class__, "_judged", lambda _, one: (one, costs[id(one)]))
@@ -524,7 +568,7 @@ def test_of_an_exchange_the_answer_that_tells_no_more_may_win(estimated, monkeyp
         kept = []
         monkeypatch.setattr(search.__class__, "_led", lambda _, best, *rest, kept=kept: kept.append(best))
         search.settle([])
-        assert kept[0] is told
+        assert kept[0] is best
 
 
 @pytest.mark.parametrize("known", [False, True])

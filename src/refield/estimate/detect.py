@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtri
@@ -128,6 +129,20 @@ def difference(view: View, picture: Array, config: DetectConfig) -> Array:
     """(H, W) Lab difference of a view's photo and a picture (H, W, 3) of what it should show."""
     sigma = blur_sigma(view, config)
     return pixels.colour_difference(pixels.blur(view.photo, sigma), pixels.blur(picture, sigma), config.reach)
+
+
+def is_of_scene(changed: Changed, survey: Sequence[View], config: DetectConfig) -> bool:
+    """Whether a photo of which much changed shows the field's scene all the same: more of its pixels are as the field
+    shows them from its own place than as it does from any of the old photos' places, each in the light that fits best.
+    """
+
+    def alike(picture: Array) -> float:
+        view = carried(replace(changed.view, rgb=picture), config)
+        return float((difference(view, picture, config) <= changed.threshold).mean())
+
+    h, w = changed.view.shape
+    others = (cv2.resize(s.rgb, (w, h), interpolation=cv2.INTER_AREA) for s in survey)
+    return alike(changed.view.rgb) > max(map(alike, others), default=0.0)
 
 
 def noise_at(view: View, survey: Sequence[Changed]) -> Array:

@@ -146,10 +146,10 @@ def pixels_of(ground: Ground, settled: Settled, k: int) -> int:
 def gained_by(ground: Ground, best: Settled, other: Settled, k: int) -> float:
     """How much less another hypothesis leaves unexplained than the best one where an object of it is or was."""
     less = [was - now for was, now in zip(best.left, other.left)]
-    return sum(float(part[where].sum()) for part, where in zip(less, _where(ground, other, k)))
+    return sum(float(part[where].sum()) for part, where in zip(less, shown_or_was(ground, other, k)))
 
 
-def _where(ground: Ground, settled: Settled, k: int) -> list[Mask]:
+def shown_or_was(ground: Ground, settled: Settled, k: int) -> list[Mask]:
     """Per photo, the pixels (H, W) that show an object, or show where it was."""
     was = [silhouette(p.view, settled.olds[k]) for p in settled.views]
     return [a | b for a, b in zip(was, _at(ground, settled, k))] if k in settled.moved else was

@@ -54,7 +54,8 @@ class EstimateConfig:
     """old photos that the field's own errors are learnt from; and as many at most of those that are held out of the
     capture tell how much of such a photo would be taken for changed"""
     most_changed: float = 0.5
-    """if more of the photos' pixels changed, they do not show this scene"""
+    """if more of a photo's pixels changed, it shows another scene, unless the field is more like it from its own place
+    than from others"""
     place: PlaceConfig = field(default_factory=PlaceConfig)
     """the new photos' poses"""
     masks: Literal["refield", "paper"] = "refield"
@@ -179,7 +180,11 @@ def _detected(
     errors = detect.errors(survey, Memory.of(field, capture.train), config.detect, left_out)
     changed = detect.changes(views, errors, config.detect)
     shares = [float(c.mask.mean()) for c in changed]
-    photos = tuple(_verdict(c.view, share, config.most_changed) for c, share in zip(changed, shares))
+    others = [
+        share > config.most_changed and not detect.is_of_scene(c, survey, config.detect)
+        for c, share in zip(changed, shares)
+    ]
+    photos = tuple(_verdict(c.view, share, other) for c, share, other in zip(changed, shares, others))
     refused = sum(p.status == "rejected" for p in photos)
     if 2 * refused > len(photos):  # what was taken with them shows hardly another place
         what = f"{100 * float(np.mean(shares)):.0f} % of the pixels changed; is this the same scene?"
@@ -223,9 +228,10 @@ def _placed(field: Field, frame: Frame, config: EstimateConfig) -> View:
     return look.view_of(field, replace(frame, world_from_cam=placed.world_from_cam), config.max_pixels)
 
 
-def _verdict(view: View, share: float, most: float) -> PlacedPhoto:
+def _verdict(view: View, share: float, other: bool) -> PlacedPhoto:
+    """``share``: of its pixels, that changed; ``other``: whether it shows another scene."""
     frame = view.frame
-    if share > most:
+    if other:
         return PlacedPhoto(frame.name, "rejected", f"{100 * share:.0f} % of its pixels changed; it shows another scene")
     gain = float(view.colour_fit[0].mean())
     why = ""

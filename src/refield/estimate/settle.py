@@ -159,8 +159,9 @@ class Search:
             return told
         for k in sorted(told.removed, key=lambda k: told.led[k]):
             if len(told.gone) > 1 and confidence("removed", told.led[k], half=False) < _EVEN:
-                fewer, _ = self._judged(self._less(told, k, self.first.get(k, told.olds[k]), []))
-                told = replace(fewer, led=told.led, twins=told.twins)
+                others = [j for j in told.touched if j != k]
+                fewer = self._hypothesis(dict(enumerate(told.olds)), others, told.moved)
+                told = replace(self._judged(fewer)[0], led=told.led, twins=told.twins)
         came = list(zip(told.arrived, told.came))
         sure = [(body, lead) for body, lead in came if confidence("added", lead, half=False) >= _EVEN]
         if len(sure) < len(came) and (sure or told.moved):
