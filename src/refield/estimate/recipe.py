@@ -180,11 +180,7 @@ def _detected(
     errors = detect.errors(survey, Memory.of(field, capture.train), config.detect, left_out)
     changed = detect.changes(views, errors, config.detect)
     shares = [float(c.mask.mean()) for c in changed]
-    others = [
-        share > config.most_changed and not detect.is_of_scene(c, survey, config.detect)
-        for c, share in zip(changed, shares)
-    ]
-    photos = tuple(_verdict(c.view, share, other) for c, share, other in zip(changed, shares, others))
+    photos = tuple(_verdict(c, share, survey, config) for c, share in zip(changed, shares))
     refused = sum(p.status == "rejected" for p in photos)
     if 2 * refused > len(photos):  # what was taken with them shows hardly another place
         what = f"{100 * float(np.mean(shares)):.0f} % of the pixels changed; is this the same scene?"
@@ -228,10 +224,10 @@ def _placed(field: Field, frame: Frame, config: EstimateConfig) -> View:
     return look.view_of(field, replace(frame, world_from_cam=placed.world_from_cam), config.max_pixels)
 
 
-def _verdict(view: View, share: float, other: bool) -> PlacedPhoto:
-    """``share``: of its pixels, that changed; ``other``: whether it shows another scene."""
-    frame = view.frame
-    if other:
+def _verdict(changed: Changed, share: float, survey: Sequence[View], config: EstimateConfig) -> PlacedPhoto:
+    """What is made of a photo of whose pixels a ``share`` changed."""
+    view, frame = changed.view, changed.view.frame
+    if share > config.most_changed and not detect.is_of_scene(changed, survey, config.detect):
         return PlacedPhoto(frame.name, "rejected", f"{100 * share:.0f} % of its pixels changed; it shows another scene")
     gain = float(view.colour_fit[0].mean())
     why = ""
