@@ -67,13 +67,13 @@ def diagnosed(folder: Path, out: Path) -> Row:
     if true is None:
         raise InputError(folder, "nothing is known of what is true there", "give a scene of the gauntlet")
     capture, began, kept = workspace.capture(), time.perf_counter(), list[tuple[Search, Settled]]()
-    frames, really = load_new_photos(folder / "data" / "after", capture), recipe.Search.turned
+    frames, really = load_new_photos(folder / "data" / "after", capture), recipe.Search.likely
 
-    def turned(search: Search, told: Settled) -> Settled:
+    def likely(search: Search, told: Settled) -> Settled:
         kept.append((search, really(search, told)))
         return kept[-1][1]
 
-    with patch.object(recipe.Search, "turned", turned):
+    with patch.object(recipe.Search, "likely", likely):
         try:
             change = recipe.estimate_change(capture, workspace.field(), frames)
         except InputError as error:

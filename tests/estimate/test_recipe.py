@@ -152,7 +152,7 @@ def test_another_scene_is_refused(old, tmp_path):
 
 
 def test_a_scene_of_which_much_changed_is_told_from_another(old, tmp_path):
-    """By the pixels that are as the field shows them from there; where an old camera was near, it may be none."""
+    """By the pixels that are as the field shows them from there, of two photos or more."""
     true = turn(centre(CRATE), 50, (0.35, -0.15, 0))
     little = EstimateConfig(survey=6, most_changed=0.005)  # of a photo's pixels
     photos = new_photos(BoxWorld((CRATE.moved(true), DRUM)), tmp_path / "moved")
@@ -164,6 +164,8 @@ def test_a_scene_of_which_much_changed_is_told_from_another(old, tmp_path):
     swapped = replace(photos[1], world_from_cam=photos[2].world_from_cam, name="swapped.png")
     change = estimate_change(old, BEFORE, [noise, swapped, *photos], little)
     assert [p.status for p in change.photos] == ["rejected", "rejected", "used", "used", "used", "used"]
+    with pytest.raises(InputError, match="is this the same scene"):  # one alone may be by chance
+        estimate_change(old, BEFORE, photos[:1], little)
 
 
 def test_a_field_that_does_not_show_its_own_photos_is_refused(old, tmp_path):

@@ -504,16 +504,34 @@ def test_what_a_thing_gains_must_be_gained_where_it_is_or_was(estimated):
     """That what arrived is outlined better beside it says nothing of it."""
     ground, _, changed, told = estimated
     search, (k,) = settle.Search(ground, changed), told.moved
-    wrong = with_left(told, 1)
+    wrong, cost = with_left(told, 1), 10_000.0
     change = replace(told.moved[k], before=0.3)
     more = replace(wrong, olds=(*told.olds, told.olds[k]), moved={**told.moved, 1: change})
     here = shown_or_was(ground, more, 1)
-    assert search._worth(wrong, replace(more, left=tuple(np.where(h, 1, 0) for h in here))) == math.inf
-    assert math.isfinite(search._worth(wrong, replace(more, left=tuple(np.where(h, 0, 1) for h in here))))
     least, pixels = search._gain(more, 1, beside=True), sum(int(h.sum()) for h in here)
-    for part, enough in ((1.1, True), (0.9, False)):
-        some = replace(more, left=tuple(np.where(h, 1 - part * least / pixels, 1) for h in here))
-        assert math.isfinite(search._worth(wrong, some)) is enough
+
+    def compared(there: float, elsewhere: float) -> float:
+        left = tuple(np.where(h, 1 - there / pixels, 1.0) for h in here)
+        return search._compared(wrong, cost, replace(more, left=left), cost - there - elsewhere)
+
+    assert compared(1.5 * least, 0) == pytest.approx(cost - 0.5 * least)
+    assert compared(0.5 * least, 2 * least) == pytest.approx(cost + 0.5 * least)
+    assert compared(0, 2 * least) == pytest.approx(cost + least)
+    assert compared(1.5 * least, -least) == pytest.approx(cost + 0.5 * least)  # and it costs more elsewhere
+    assert search._compared(wrong, cost, replace(more, left=wrong.left), cost + 1) == cost + 1
+
+
+def test_what_a_part_gains_by_its_pose_speaks_for_what_is_left_of_its_outline(estimated):
+    """The whole was told as left; a part of it moved, and the rest of it left: nothing is gained where that was."""
+    ground, _, changed, told = estimated
+    search, (k,) = settle.Search(ground, changed), told.moved
+    gone = replace(with_left(told, 1), moved={}, removed={k: 1.0})
+    there = [now & ~was for now, was in zip(shown_or_was(ground, told, k), shown_or_was(ground, gone, k))]
+    apart = replace(told, olds=(*told.olds, told.olds[k]), removed={1: 0.9})
+    apart = replace(apart, left=tuple(np.where(h, 0.0, 1.0) for h in there))
+    gained = sum(int(h.sum()) for h in there)
+    assert gained > search._worth(gone, apart) > 0
+    assert search._compared(gone, 1e4, apart, 1e4 - gained) == pytest.approx(1e4 - gained + search._worth(gone, apart))
 
 
 def test_what_left_or_arrived_beside_others_is_told_only_if_it_is_likelier_than_not(estimated):
@@ -526,8 +544,11 @@ def test_what_left_or_arrived_beside_others_is_told_only_if_it_is_likelier_than_
     for led, told in ((0.4, []), (0.6, [other])):
         likely = search.likely(replace(two, led={k: 0.5, other: led}))
         assert list(likely.removed) == told and list(likely.moved) == [k] and likely.led[k] == 0.5
-    alone = replace(two, moved={}, led={other: 0.1})
-    assert search.likely(alone) is alone
+        # beside one that left as likely as not, or alone, with nothing else told
+        likely = search.likely(replace(two, moved={}, removed={k: 0.9, other: 0.9}, led={k: 0.6, other: led}))
+        assert list(likely.removed) == [k, *told]
+        alone = replace(two, moved={}, led={other: led})
+        assert search.likely(alone).removed == alone.removed
     for came, told in ((0.8, 0), (0.9, 1)):
         assert len(search.likely(replace(found, arrived=(body,), came=(came,))).arrived) == told
         assert len(search.likely(replace(found, moved={}, arrived=(body,), came=(came,))).arrived) == 1

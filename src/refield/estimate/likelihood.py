@@ -46,7 +46,7 @@ class Settled:
     led: dict[int, float] = field(default_factory=dict)
     """by index of the old object: pixels that the best other answer for it does not explain and this one does, as a
     part of those that show it or show where it was"""
-    left: tuple[Array, ...] = ()
+    left: tuple[Array, ...] = field(default=(), compare=False)
     """(H, W) of each photo, what is left unexplained of its pixels"""
     twins: dict[int, tuple[PoseChange, ...]] = field(default_factory=dict)
     """by index of the old object that moved: other poses at its place that explain as much"""
@@ -143,10 +143,21 @@ def pixels_of(ground: Ground, settled: Settled, k: int) -> int:
     return there + (pixels_at(ground, settled, k) if k in settled.moved else 0)
 
 
-def gained_by(ground: Ground, best: Settled, other: Settled, k: int) -> float:
-    """How much less another hypothesis leaves unexplained than the best one where an object of it is or was."""
-    less = [was - now for was, now in zip(best.left, other.left)]
-    return sum(float(part[where].sum()) for part, where in zip(less, shown_or_was(ground, other, k)))
+def gained_apart(ground: Ground, best: Settled, other: Settled) -> float:
+    """How much less another hypothesis leaves unexplained than the best one where anything is or was of which the two
+    tell otherwise that it moved or left, newcomers not counted among such things."""
+    apart = [np.zeros(p.view.shape, bool) for p in other.views]
+    for k in {*best.moved, *best.removed, *other.moved, *other.removed}:
+        if _tells(best, k) != _tells(other, k):
+            for one in (best, other):
+                if k in one.moved or k in one.removed:
+                    apart = [a | shown for a, shown in zip(apart, shown_or_was(ground, one, k))]
+    return sum(float((was - now)[where].sum()) for was, now, where in zip(best.left, other.left, apart))
+
+
+def _tells(settled: Settled, k: int) -> tuple[object, ...]:
+    """What a hypothesis says of an object, to be compared by identity."""
+    return (k in settled.removed, id(settled.moved.get(k)), id(settled.olds[k]) if k < len(settled.olds) else None)
 
 
 def shown_or_was(ground: Ground, settled: Settled, k: int) -> list[Mask]:

@@ -54,8 +54,8 @@ class EstimateConfig:
     """old photos that the field's own errors are learnt from; and as many at most of those that are held out of the
     capture tell how much of such a photo would be taken for changed"""
     most_changed: float = 0.5
-    """if more of a photo's pixels changed, it shows another scene, unless the field is more like it from its own place
-    than from others"""
+    """if more of a photo's pixels changed, it shows another scene, unless the field is more like it, and like another
+    such photo, from its own place than from others"""
     place: PlaceConfig = field(default_factory=PlaceConfig)
     """the new photos' poses"""
     masks: Literal["refield", "paper"] = "refield"
@@ -173,14 +173,17 @@ def _detected(
 ) -> _Scene:
     chosen = look.spread_out(capture.frames, config.survey)
     names = {f.name for f in chosen}
-    others = [f for f in look.spread_out(capture.held_out, config.survey) if f.name not in names]
-    survey, left_out = ([look.view_of(field, f, config.max_pixels) for f in some] for some in (chosen, others))
+    beside = [f for f in look.spread_out(capture.held_out, config.survey) if f.name not in names]
+    survey, left_out = ([look.view_of(field, f, config.max_pixels) for f in some] for some in (chosen, beside))
     _check_knows(survey)
     views = [_placed(field, f, config) for f in frames]
     errors = detect.errors(survey, Memory.of(field, capture.train), config.detect, left_out)
     changed = detect.changes(views, errors, config.detect)
     shares = [float(c.mask.mean()) for c in changed]
-    photos = tuple(_verdict(c, share, survey, config) for c, share in zip(changed, shares))
+    much = [share > config.most_changed for share in shares]
+    same = [m and detect.is_of_scene(c, survey, config.detect) for c, m in zip(changed, much)]
+    others = [m and not (one and sum(same) > 1) for m, one in zip(much, same)]  # one alone may be by chance
+    photos = tuple(_verdict(c.view, share, other) for c, share, other in zip(changed, shares, others))
     refused = sum(p.status == "rejected" for p in photos)
     if 2 * refused > len(photos):  # what was taken with them shows hardly another place
         what = f"{100 * float(np.mean(shares)):.0f} % of the pixels changed; is this the same scene?"
@@ -224,10 +227,10 @@ def _placed(field: Field, frame: Frame, config: EstimateConfig) -> View:
     return look.view_of(field, replace(frame, world_from_cam=placed.world_from_cam), config.max_pixels)
 
 
-def _verdict(changed: Changed, share: float, survey: Sequence[View], config: EstimateConfig) -> PlacedPhoto:
-    """What is made of a photo of whose pixels a ``share`` changed."""
-    view, frame = changed.view, changed.view.frame
-    if share > config.most_changed and not detect.is_of_scene(changed, survey, config.detect):
+def _verdict(view: View, share: float, other: bool) -> PlacedPhoto:
+    """What is made of a photo of whose pixels a ``share`` changed; ``other``: whether it shows another scene."""
+    frame = view.frame
+    if other:
         return PlacedPhoto(frame.name, "rejected", f"{100 * share:.0f} % of its pixels changed; it shows another scene")
     gain = float(view.colour_fit[0].mean())
     why = ""

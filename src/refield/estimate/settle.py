@@ -41,7 +41,7 @@ from refield.estimate.ground import Ground
 from refield.estimate.kept import Kept
 from refield.estimate.lattice import Body
 from refield.estimate.layers import Sight
-from refield.estimate.likelihood import Settled, gained_by, judged, pixels_at, pixels_of, unexplained_at
+from refield.estimate.likelihood import Settled, gained_apart, judged, pixels_at, pixels_of, unexplained_at
 from refield.estimate.look import Array
 from refield.estimate.objects import Old
 from refield.estimate.outline import as_one, standing
@@ -109,20 +109,27 @@ class Search:
                 if this in tried:
                     continue
                 others = [self._judged(other) for other in tries(best)]
-                asked = [
-                    left + self._worth(best, o, this[0] in _PIECES) if left < least else left for o, left in others
-                ]
+                asked = [self._compared(best, least, o, left, this[0] in _PIECES) for o, left in others]
                 tried[this] = min(asked, default=math.inf)
                 if tried[this] < least - 1:
                     best, least = others[asked.index(tried[this])]
                     again, tried = True, {}
                 self.ground.tally.count(sum(that not in tried for that, _ in exchanges[k:]))
-        if begun is not None and self._judged(begun)[1] <= least + self._worth(begun, best):
-            return begun
+        if begun is not None:
+            before = self._judged(begun)[1]
+            if self._compared(begun, before, best, least) >= before:
+                return begun
         return self._led(best, least, tried)
 
     def _judged(self, settled: Settled) -> tuple[Settled, float]:
         return self.costs.get((settled,), lambda: judged(self.ground, settled))
+
+    def _compared(self, best: Settled, least: float, other: Settled, left: float, piece: bool = False) -> float:
+        """What a hypothesis costs, beside the best one, which costs ``least``: with what the things more must gain that
+        it tells of, and no less than it is cheaper where what became of anything is told otherwise. What arrived has
+        another outline beside a thing more; that says nothing of the thing."""
+        worth = self._worth(best, other, piece) if left < least else 0.0
+        return left if worth == 0 else worth + max(left, least - gained_apart(self.ground, best, other))
 
     def _worth(self, best: Settled, other: Settled, piece: bool = False) -> float:
         """How many pixels less than the best one a hypothesis must leave unexplained: of each thing more that moved or
@@ -137,10 +144,7 @@ class Search:
         if not beside and not piece:
             return 0.0
         told, now = best.moved.keys() | best.removed.keys(), other.moved.keys() | other.removed.keys()
-        gains = {k: self._gain(other, k, beside) for k in now - told}
-        if any(gained_by(self.ground, best, other, k) < gain for k, gain in gains.items()):
-            return math.inf
-        worth = sum(gains.values())
+        worth = sum(self._gain(other, k, beside) for k in now - told)
         if not piece:  # it is told beside, or in place of, a whole that fits as well
             worth -= sum(self._gain(best, k, beside) for k in told - now)
         return max(worth, 0.0)
@@ -153,20 +157,16 @@ class Search:
         return gains * pixels_of(self.ground, settled, k)
 
     def likely(self, told: Settled) -> Settled:
-        """What was settled, without what left or arrived beside other things and is less likely so than not; unless
-        both did, which may be one thing that moved."""
+        """What was settled, without what left or arrived and by its lead is less likely so than not, beside what moved
+        or is likelier; unless something left and something arrived, which may be one thing that moved."""
         if told.removed and told.arrived:
             return told
-        for k in sorted(told.removed, key=lambda k: told.led[k]):
-            if len(told.gone) > 1 and confidence("removed", told.led[k], half=False) < _EVEN:
-                others = [j for j in told.touched if j != k]
-                fewer = self._hypothesis(dict(enumerate(told.olds)), others, told.moved)
-                told = replace(self._judged(fewer)[0], led=told.led, twins=told.twins)
-        came = list(zip(told.arrived, told.came))
-        sure = [(body, lead) for body, lead in came if confidence("added", lead, half=False) >= _EVEN]
-        if len(sure) < len(came) and (sure or told.moved):
-            told = replace(told, arrived=tuple(body for body, _ in sure), came=tuple(lead for _, lead in sure))
-        return told
+        removed = {k: v for k, v in told.removed.items() if confidence("removed", told.led[k], half=False) >= _EVEN}
+        came = [one for one in zip(told.arrived, told.came) if confidence("added", one[1], half=False) >= _EVEN]
+        if not (told.moved or removed or came):
+            return told
+        bodies, leads = tuple(body for body, _ in came), tuple(lead for _, lead in came)
+        return replace(told, removed=removed, arrived=bodies, came=leads)
 
     def turned(self, told: Settled) -> Settled:
         """What was settled, with each object rotated about its place as the photos show more of it, where they show
