@@ -473,31 +473,29 @@ def test_pieces_are_those_of_the_hypothesis_that_they_are_asked_beside(estimated
     assert ("cut", 0, id(found.olds[0])) in exchanges
 
 
-def with_left(settled: Settled, much: float) -> Settled:
-    """The hypothesis as if it left so much of each pixel unexplained."""
-    return replace(settled, left=tuple(np.full_like(left, much) for left in settled.left))
-
-
 def test_a_thing_more_is_told_only_for_as_much_as_a_pose_must_gain(estimated):
-    ground, _, changed, told = estimated
-    search, (k,), gains = settle.Search(ground, changed), told.moved, ground.believe.gains
-    wrong, found = with_left(told, 1), with_left(told, 0)
+    ground, _, changed, found = estimated
+    search, (k,), gains = settle.Search(ground, changed), found.moved, ground.believe.gains
     change = replace(found.moved[k], before=0.3)
     more = replace(found, olds=(*found.olds, found.olds[k]), moved={**found.moved, 1: change})
     least = gains * pixels_of(ground, more, 1)
-    assert search._worth(wrong, more) == pytest.approx(least) and least > 100
+    assert search._worth(found, more) == pytest.approx(least) and least > 100
     alike = replace(more, moved={**found.moved, 1: replace(change, before=0.6)})
-    assert search._worth(wrong, alike) == pytest.approx(2 * least)
+    assert search._worth(found, alike) == pytest.approx(2 * least)
     left = replace(more, moved=found.moved, removed={1: 0.9})
-    assert search._worth(wrong, left) == pytest.approx(gains * pixels_of(ground, left, 1))
-    assert search._worth(wrong, left) < search._worth(wrong, more)
-    more_wrong = with_left(more, 1)
-    assert search._worth(more_wrong, found) == search._worth(more_wrong, left) == search._worth(wrong, found) == 0
+    assert search._worth(found, left) == pytest.approx(gains * pixels_of(ground, left, 1))
+    assert search._worth(found, left) < search._worth(found, more)
+    assert search._worth(more, found) == search._worth(more, left) == search._worth(found, found) == 0
     instead = replace(more, moved={1: change})
-    assert search._worth(wrong, instead) == 0 < search._worth(wrong, instead, piece=True)
-    nothing = settle.Settled(views=wrong.views, olds=more.olds, left=wrong.left)
+    assert search._worth(found, instead) == 0 < search._worth(found, instead, piece=True)
+    nothing = settle.Settled(views=found.views, olds=more.olds)
     assert search._worth(nothing, more) == 0 < search._worth(nothing, left, piece=True) < 2 * least
     assert search._worth(nothing, replace(alike, moved={1: alike.moved[1]}), piece=True) == pytest.approx(least)
+
+
+def with_left(settled: Settled, much: float) -> Settled:
+    """The hypothesis as if it left so much of each pixel unexplained."""
+    return replace(settled, left=tuple(np.full_like(left, much) for left in settled.left))
 
 
 def test_what_a_thing_gains_must_be_gained_where_it_is_or_was(estimated):

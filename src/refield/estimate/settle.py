@@ -59,8 +59,6 @@ _PIECES = ("cut", "parted")
 """exchanges that tell pieces of an outline for things"""
 _OTHERS = ("elsewhere", "again", "stayed")
 """what says of an object something else, not the same more exactly"""
-
-
 _EVEN = 0.5
 """confidence in what is as likely as not"""
 
